@@ -20,7 +20,7 @@ from scipy import stats
 
 from polarguide.core.errors import PolarguideError
 from polarguide.results.evaluation.table import METRICS, OBJECT_METRICS
-from polarguide_bench.record import read_results
+from polarguide_bench.results import read_results
 
 BY_KEY = {metric.key: metric for metric in METRICS}
 COLUMNS = {

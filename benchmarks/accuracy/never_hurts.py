@@ -29,7 +29,7 @@ import msgspec
 
 from polarguide.core.errors import PolarguideError
 from polarguide.results.evaluation.table import METRICS
-from polarguide_bench.record import read_results
+from polarguide_bench.results import read_results
 
 PICTURE = {"psnr": 0.15, "psnr_foreground": 0.15}
 LAYERS = {"specular_psnr": 0.2, "diffuse_psnr": 0.2}

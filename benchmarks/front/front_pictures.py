@@ -24,7 +24,7 @@ import polarguide as pg
 from polarguide.geometry.camera import Camera
 from polarguide.geometry.trajectory import orbit
 from polarguide.visualization.figures import Picture, contact_sheet
-from polarguide.visualization.layers import ground_truth_pictures, layer_picture
+from polarguide.visualization.figures import ground_truth_pictures, layer_picture
 
 IMAGES = Path(__file__).resolve().parents[2] / "docs" / "images"
 PAGES = IMAGES.parent / "_static" / "scenes"

@@ -1,36 +1,36 @@
-"""``polarguide batch``: each capture of a collection from its files to its exports, and one page over all."""
+"""``polarguide batch``: process each capture of a collection up to its exports, and write an overview page."""
 
 from __future__ import annotations
 
 import contextlib
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 
 from polarguide.capture.layout import find_layout, refuse_scene
-from polarguide.core.errors import PolarguideError
+from polarguide.core.errors import PolarguideError, require
 from polarguide.core.files import check_out, make_folder, require_inside, write_text
-from polarguide.core.options import ComputeOptions, PathLike, SceneOptions
+from polarguide.core.options import ComputeOptions, PathLike
 from polarguide.core.progress import SILENT, Reporter
 from polarguide.inspection.report import FILE as INSPECTION_PAGE
-from polarguide.preparation.settings import PrepareSettings
 from polarguide.raster import choose_backend
 from polarguide.recipes import recipe_named
 from polarguide.results.evaluation.record import read_metrics
 from polarguide.results.evaluation.table import COLUMNS
 from polarguide.runs.folder import CHECKPOINT, RunConfiguration
-from polarguide.training.settings import TrainSettings
 from polarguide.visualization.pages import page
-from polarguide_bench.collection import (
+from polarguide_bench.children import (
+    FORMAT,
     INSPECTION,
     RECORD,
     RUN,
     SHARE,
     STEPS,
+    Capture,
     CaptureRecord,
     Processing,
     Request,
@@ -50,11 +50,15 @@ TABLE = "results.csv"
 
 @dataclass(frozen=True)
 class CaptureRow:
-    """A capture on the page.
+    """A capture on the overview page.
 
     Attributes:
-        name, source: those of the capture. folder: folder of its results. state: "done", "failed" or "waiting".
-        error: why it failed, in one line. record: how far it is.
+        name: name of the capture.
+        source: path of its files.
+        folder: folder of its results.
+        state: "done", "failed" or "waiting".
+        error: reason of a failure, in one line.
+        record: progress and results.
     """
 
     name: str
@@ -62,42 +66,38 @@ class CaptureRow:
     folder: Path
     state: str
     error: str
-    record: CaptureRecord | None
+    record: CaptureRecord
 
     def scores(self) -> dict[str, Any]:
-        """By metric; empty before they are there."""
-        if self.record is None or "eval" not in self.record.done:
-            return {}
-        try:
-            return dict(read_metrics(self.folder / RUN))
-        except (OSError, PolarguideError):  # it was removed
-            return {}
+        """Return the scores by metric; empty before the evaluation."""
+        if "eval" in self.record.done:
+            with contextlib.suppress(OSError, PolarguideError):  # the user may have removed the file
+                return dict(read_metrics(self.folder / RUN))
+        return {}
 
     def remarks(self) -> tuple[str, ...]:
-        """Findings of the inspection, and warnings of the training."""
-        if self.record is None:
-            return ()
-        polarization, own = recorded_health(self.folder / RUN) if "train" in self.record.done else (None, ())
+        """Return the findings of the inspection and the warnings of the training."""
+        polarization, warnings = (
+            recorded_health(self.folder / RUN) if "train" in self.record.done else (None, ())
+        )
         evidence = () if polarization is None else (f"polarization: {polarization}",)
-        return (*self.record.findings, *evidence, *own)
+        return (*self.record.findings, *evidence, *warnings)
 
     def links(self) -> list[tuple[str, str]]:
-        """Label and path of what there is, from the folder of all."""
-        at = f"{self.folder.parent.name}/{self.folder.name}"
-        if self.record is None:
-            return []
-        made_by = {
+        """Return label and path of each existing result, relative to the page."""
+        results = {
             "inspect": ("inspection", f"{INSPECTION}/{INSPECTION_PAGE}"),
             "eval": ("where the errors are", f"{RUN}/errors.png"),
             "share": ("scene", SHARE),
         }
-        named = [link for step, link in made_by.items() if step in self.record.done]
+        named = [link for step, link in results.items() if step in self.record.done]
         named += [(Path(file).name, file) for file in self.record.files]
+        at = f"{self.folder.parent.name}/{self.folder.name}"
         return [(label, f"{at}/{path}") for label, path in named if (self.folder / path).exists()]
 
 
 def write_page(out: Path, rows: Sequence[CaptureRow]) -> None:
-    """Write ``index.html`` and ``results.csv``, each in one step. The page links to files in the captures' folders."""
+    """Write ``index.html`` and ``results.csv`` atomically. The page links to files in the captures' folders."""
     scores = {row.name: row.scores() for row in rows}
     columns = [
         column
@@ -114,15 +114,7 @@ def write_page(out: Path, rows: Sequence[CaptureRow]) -> None:
         ),
         columns=columns,
         rows=[
-            {
-                "row": row,
-                "pictures": () if row.record is None else row.record.pictures,
-                "verdict": "" if row.record is None else row.record.verdict,
-                "cells": [formatted(scores[row.name].get(column.key), column) for column in columns],
-                "remarks": row.remarks(),
-                "links": row.links(),
-            }
-            for row in rows
+            (row, [formatted(scores[row.name].get(column.key), column) for column in columns]) for row in rows
         ],
     )
     write_text(out / PAGE, html)
@@ -132,7 +124,7 @@ def write_page(out: Path, rows: Sequence[CaptureRow]) -> None:
                 "name": row.name,
                 "path": row.source,
                 "state": row.state,
-                "verdict": "" if row.record is None else row.record.verdict,
+                "verdict": row.record.verdict,
                 **{column.key: scores[row.name].get(column.key) for column in columns},
                 "error": row.error,
             }
@@ -145,25 +137,7 @@ def write_page(out: Path, rows: Sequence[CaptureRow]) -> None:
 CAPTURES = "captures"
 """Folder of the captures' folders."""
 WORK_BYTES = 2_000_000_000
-"""Memory that a job of SLURM or PBS asks for: sizes of captures are not known before they are prepared."""
-
-
-@dataclass(frozen=True)
-class Capture:
-    """A capture of a collection, and what to do with it.
-
-    Attributes:
-        name: name of its folder in the results. path: its files, or a scene.
-        prepare: how to prepare it; not used for a scene.
-        recipe, settings, reading: those of its training.
-    """
-
-    name: str
-    path: Path
-    prepare: PrepareSettings = field(default_factory=PrepareSettings)
-    recipe: str = "polarguide-stokes"
-    settings: TrainSettings = TrainSettings()
-    reading: SceneOptions = SceneOptions()
+"""Memory request of a job of SLURM or PBS. The size of a capture is unknown before its preparation."""
 
 
 def run_batch(
@@ -173,26 +147,25 @@ def run_batch(
     *,
     reporter: Reporter = SILENT,
 ) -> list[CaptureRow]:
-    """Prepare, inspect, train, score, share and export every capture, each in a process of its own.
+    """Prepare, inspect, train, score, share and export each capture in its own process.
 
-    Writes a folder for each to ``captures/`` of ``out``, and ``index.html`` and ``results.csv`` over all whenever one
-    has ended. One that fails is a row with its error; the others go on. What is done is found again and not repeated;
-    KeyboardInterrupt is passed on after trainings have saved their state, and the same call goes on with them.
+    Each capture has a folder in ``captures/`` of ``out``. ``index.html`` and ``results.csv`` list all captures and are
+    updated at the end of each. A failed capture is a row with its error and does not affect others. Finished steps are
+    not repeated. After a KeyboardInterrupt trainings save their states, and the same call resumes.
 
     Args:
-        captures: with names of their own.
-        out: folder to write.
-        options: where to compute, and what to export.
+        captures: captures with unique names.
+        out: output folder.
+        options: place of the computation, and formats of the export.
         reporter: receives messages and progress.
 
     Returns:
         The rows of the page.
 
     Raises:
-        PolarguideError: no capture, a recipe that does not exist, or another batch at work in ``out``.
+        PolarguideError: no captures, an unknown recipe, or another batch is writing to ``out``.
     """
-    if not captures:
-        raise PolarguideError("batch", expected="a capture", found="none", remedy="Name at least one.")
+    require(captures, "batch", expected="a capture", found="no capture", remedy="Name at least one.")
     for capture in captures:
         recipe_named(capture.recipe)
     root = Path(out)
@@ -200,18 +173,18 @@ def run_batch(
     refuse_scene(root)
     gpus = own_gpus(choose_backend(options.device)) if options.local else ()
     make_folder(root / CAPTURES)
-    tasks = {capture.name: _task(capture, root, options) for capture in captures}
-    require_inside(root, *(Path(task.folder) for task in tasks.values()))
+    tasks = [_task(capture, root, options) for capture in captures]
+    require_inside(root, *(Path(task.folder) for task in tasks))
     with locked(root, "batch"):
         failures: dict[str, str] = {}
-        rows = _rows(tasks, failures)
-        todo = [task for task, row in zip(tasks.values(), rows, strict=True) if row.state != "done"]
+        rows = [_row(task, failures) for task in tasks]
+        todo = [task for task, row in zip(tasks, rows, strict=True) if row.state != "done"]
         reporter.say(f"captures: {len(tasks)}, of them finished before: {len(tasks) - len(todo)}")
 
         def end(job: Job, error: str | None) -> None:
             if error is not None:
                 failures[job.label] = error
-            write_page(root, _rows(tasks, failures))
+            write_page(root, [_row(task, failures) for task in tasks])
 
         write_page(root, rows)
         count = jobs_at_a_time(options, max(1, len(todo)), 0, gpus)
@@ -220,11 +193,11 @@ def run_batch(
                 options, count=count, threads=options.threads, memory=WORK_BYTES, gpus=gpus, reporter=reporter
             ) as at:
                 run_jobs([_job(task) for task in todo], at, reporter=reporter, on_end=end)
-        return _rows(tasks, failures)
+        return [_row(task, failures) for task in tasks]
 
 
 def is_scene(folder: Path) -> bool:
-    """Whether a folder is a scene with poses, which needs no preparation."""
+    """Return True if a folder is a scene with poses, which needs no preparation."""
     with contextlib.suppress(PolarguideError, OSError):
         return (folder / "sparse").is_dir() and bool(find_layout(folder))
     return False
@@ -235,7 +208,7 @@ def _task(capture: Capture, root: Path, options: BatchOptions) -> Processing:
     folder = (root / CAPTURES / capture.name).absolute()
     stamp = source_stamp(path)
     earlier = None
-    with contextlib.suppress(PolarguideError):  # the child says what is wrong with its record
+    with contextlib.suppress(PolarguideError):  # the child reports an invalid record
         earlier = CaptureRecord.load(folder)
     request = Request(
         source=str(path),
@@ -251,43 +224,35 @@ def _task(capture: Capture, root: Path, options: BatchOptions) -> Processing:
 
 
 def _job(task: Processing) -> Job:
-    """The job that processes a capture. It counts as one piece of work, since its steps take very different times."""
+    """Return the job that processes a capture. Its steps differ in length, so it counts as one unit of work."""
     folder = Path(task.folder)
 
     def progress() -> tuple[int, str]:
-        try:
+        note = ""
+        with contextlib.suppress(
+            OSError, PolarguideError
+        ):  # a missing or invalid file, which the child reports
             record = CaptureRecord.load(folder)
-        except PolarguideError:  # the child says what is wrong with it
-            return 0, ""
-        if record is None or record.at is None:
-            return 0, ""
-        note = f"{record.at} ({STEPS.index(record.at) + 1} of {len(STEPS)})"
-        with contextlib.suppress(OSError, PolarguideError):  # it is about to be written
-            if record.at == "train":
-                steps = RunConfiguration.load(folder / RUN).settings.steps
-                step, words = training_progress(folder / RUN, steps)
-                note = f"{note}: {step:,}/{steps:,}  {words}"
+            if record is not None and record.at is not None:
+                note = f"{record.at} ({STEPS.index(record.at) + 1} of {len(STEPS)})"
+                if record.at == "train":
+                    steps = RunConfiguration.load(folder / RUN).settings.steps
+                    step, quality = training_progress(folder / RUN, steps)
+                    note = f"{note}: {step:,}/{steps:,}  {quality}"
         return 0, note
 
-    saved = (folder / RECORD, folder / RUN / CHECKPOINT)
-    return Job(task.name, folder, lambda: (task,), 1, progress, saved)
+    return Job(task.name, folder, lambda: (task,), 1, progress, (folder / RECORD, folder / RUN / CHECKPOINT))
 
 
-def _rows(tasks: dict[str, Processing], failures: dict[str, str]) -> list[CaptureRow]:
-    """A row for each capture, by what its folder holds."""
-    rows = []
-    for name, task in tasks.items():
-        folder = Path(task.folder)
-        error = failures.get(name, "")
-        record = None
-        try:
-            record = CaptureRecord.load(folder)
-            if record is not None:
-                record.require(task.request, folder)
-        except PolarguideError as problem:
-            error = error or str(problem)
-        state = "failed" if error else "waiting"
-        if record is not None and not error and set(record.done) == set(STEPS):
-            state = "done"
-        rows.append(CaptureRow(name, task.request.source, folder, state, error, record))
-    return rows
+def _row(task: Processing, failures: dict[str, str]) -> CaptureRow:
+    """Return the row of a capture according to its folder."""
+    folder = Path(task.folder)
+    error = failures.get(task.name, "")
+    record = CaptureRecord(FORMAT, task.request)
+    try:
+        record = CaptureRecord.load(folder) or record
+        record.require(task.request, folder)
+    except PolarguideError as problem:
+        error = error or str(problem)
+    finished = "done" if set(record.done) == set(STEPS) else "waiting"
+    return CaptureRow(task.name, task.request.source, folder, "failed" if error else finished, error, record)

@@ -1,4 +1,4 @@
-"""``polarguide bench``: render the scenes of the bench where they are missing, and compare its rows on them."""
+"""``polarguide bench``: render the missing scenes of the bench, and compare its rows on them."""
 
 from __future__ import annotations
 
@@ -32,42 +32,43 @@ def run_bench(
     bench: Bench = BENCH,
     reporter: Reporter = SILENT,
 ) -> Results | None:
-    """Render what is missing of one half of the bench, then compare the rows on it.
+    """Render the missing scenes of a half of the bench, then compare the rows on them.
 
-    Writes the scenes to ``scenes/NAME`` of ``out``, and the comparison to its ``development`` or ``held-back``. What is
-    finished is checked and not repeated; after a KeyboardInterrupt the same call goes on.
+    Scenes are written to ``scenes/NAME`` of ``out``, and the comparison to its ``development`` or ``held-back``.
+    Finished work is verified and not repeated. After a KeyboardInterrupt the same call resumes.
 
     Args:
-        out: folder to write.
-        options: which half and which of its scenes, and on what to compute.
+        out: output folder.
+        options: half, scenes, and place of the computation.
         bench: scenes, rows and settings.
-        reporter: receives messages and progress, and the SHA-256 of every scene.
+        reporter: receives messages and progress, and the SHA-256 of each scene.
 
     Returns:
-        The results of the comparison, or None if nothing was to be trained.
+        The results of the comparison, or None with ``render_only``.
 
     Raises:
-        PolarguideError: a scene of ``out`` is of other settings or another version of its preset, or a file of it has
-            changed; Mitsuba is missing and not all is rendered; as ``compare``. Nothing is written before all scenes
-            have been looked at.
+        PolarguideError: a scene in ``out`` has other settings or another version of its preset, or a changed file;
+            Mitsuba is missing and a scene is not rendered; see ``compare``. All scenes are checked before any file is
+            written.
     """
     specs = {name: Overrides(views=bench.views).apply(find_scene(name)) for name in options.chosen(bench)}
     refuse_scene(Path(out))
     rows = {} if options.render_only else dict(bench.rows)
-    for name in rows:  # hours of rendering should not end in a wrong name
+    for name in rows:  # an unknown recipe is reported before hours of rendering
         recipe_named(name)
     if options.local:
         choose_backend(options.device)
-    lacking = missing_package() if rows else None
-    if lacking is not None:
-        reporter.warn(f"mesh scores will have no value: {lacking}")
-    places = {name: Path(out) / SCENES / spec.name for name, spec in specs.items()}
+    reason = missing_package() if rows else None
+    if reason is not None:
+        reporter.warn(f"mesh scores will have no value: {reason}")
+    scenes = Path(out) / SCENES
+    places = {name: scenes / spec.name for name, spec in specs.items()}
     states = {name: _state(places[name], spec, bench) for name, spec in specs.items()}
     threads = options.jobs * options.threads
     plans = [Plan(spec, bench.synth, places[name]) for name, spec in specs.items()]
-    expected_time(plans, reporter, threads=threads)  # an error now where there is no Mitsuba
-    make_folder(Path(out) / SCENES)
-    with locked(Path(out) / SCENES):
+    expected_time(plans, reporter, threads=threads)  # reports a missing Mitsuba
+    make_folder(scenes)
+    with locked(scenes):
         for name, spec in specs.items():
             if states[name] != "finished":
                 synthesize(spec, places[name], bench.synth, reporter, threads=threads)
@@ -87,28 +88,26 @@ def run_bench(
 
 
 def _state(place: Path, spec: SceneSpec, bench: Bench) -> State:
-    """How far the rendering of a scene is; a finished one is compared with its checksums.
+    """Return the state of a scene's rendering. A finished scene is verified with its checksums.
 
     Raises:
-        PolarguideError: the folder holds something else, or the scene differs from that of the bench.
+        PolarguideError: the folder contains other files, or the scene differs from that of the bench.
     """
     try:
         state = folder_state(place, scene_request(spec, bench.synth))
         if state == "finished":
             verify_scene(place)
+        return state
     except PolarguideError as error:
         raise PolarguideError(
             error.where,
             expected=f"{error.expected}, as this version's bench renders {spec.name}",
             found=error.found,
-            remedy=f"Remove {place} to render it anew, or give another --out.",
+            remedy=f"Remove {place} to render it again, or give another --out.",
         ) from error
-    return state
 
 
 def _command(out: PathLike, options: BenchOptions, places: Mapping[str, Path]) -> str:
-    """The command line that asks for this."""
-    line = ["polarguide", "bench", "--out", str(out)]
-    line += ["--held-back"] if options.held_back else []
-    line += ["--scenes", *places] if options.scenes else []
-    return shlex.join(line)
+    half = ["--held-back"] if options.held_back else []
+    scenes = ["--scenes", *places] if options.scenes else []
+    return shlex.join(["polarguide", "bench", "--out", str(out), *half, *scenes])

@@ -1,7 +1,7 @@
-"""Tasks of a comparison or a batch, each in a child process that a worker of dask watches.
+"""Tasks of comparisons and batches, and the child processes that perform them on workers of dask.
 
-A worker imports this module and none that imports torch. It computes nothing itself: it answers its scheduler at all
-times, and a child's memory, threads and signals are its own.
+Workers and the command line import this module, so it does not import torch. A worker computes nothing itself. It
+therefore always answers its scheduler, and each child has its own memory, threads and signals.
 """
 
 from __future__ import annotations
@@ -13,34 +13,215 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import msgspec
 
-from polarguide.core.files import make_folder
-from polarguide.core.options import ComputeOptions, SceneOptions
+from polarguide.core.errors import require
+from polarguide.core.files import make_folder, write_whole
+from polarguide.core.options import ComputeOptions, ExportFormat, SceneOptions
+from polarguide.core.records import read_record, to_json
+from polarguide.core.text import canonical
+from polarguide.preparation.settings import PrepareSettings
 from polarguide.training.settings import TrainSettings
-from polarguide_bench.collection import Processing
+
+FORMAT = 1
+"""Version of the record of a capture."""
+RECORD = "capture.json"
+"""File of the record in the folder of a capture."""
+SCENE = "scene"
+"""Scene folder in the folder of a capture."""
+INSPECTION = "inspection"
+"""Folder of the inspection."""
+RUN = "run"
+"""Run folder."""
+EXPORT = "export"
+"""Folder of the exports."""
+SHARE = "share.html"
+"""File of the shared page."""
+Step = Literal["prepare", "inspect", "train", "eval", "share", "export"]
+STEPS: tuple[Step, ...] = ("prepare", "inspect", "train", "eval", "share", "export")
+"""Steps of a capture in their order."""
+NO_FILES = (0, 0, 0)
+"""Stamp of an empty or missing folder."""
+
+
+@dataclass(frozen=True)
+class Capture:
+    """A capture of a collection, and the options for it.
+
+    Attributes:
+        name: name of its folder in the results.
+        path: folder of its files, or a scene.
+        prepare: settings of the preparation, unused for a scene.
+        recipe: recipe of the training.
+        settings: settings of the training.
+        reading: options for reading the scene.
+    """
+
+    name: str
+    path: Path
+    prepare: PrepareSettings = field(default_factory=PrepareSettings)
+    recipe: str = "polarguide-stokes"
+    settings: TrainSettings = TrainSettings()
+    reading: SceneOptions = SceneOptions()
+
+
+class Request(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Inputs that determine the results of a capture.
+
+    Attributes:
+        source: absolute path of the capture's folder.
+        stamp: number, total size and newest modification time of its files.
+        prepare: ``PrepareSettings.record()``; None if the source is a scene.
+        recipe: recipe of the training.
+        settings: settings of the training.
+        reading: options for reading the scene.
+        formats: formats of the export.
+        digest: SHA-256 of the names and contents of the files. It identifies unchanged files with a new stamp. Records
+            of earlier versions have an empty digest.
+    """
+
+    source: str
+    stamp: tuple[int, int, int]
+    prepare: dict[str, Any] | None
+    recipe: str
+    settings: TrainSettings
+    reading: SceneOptions
+    formats: tuple[ExportFormat, ...]
+    digest: str = ""
+
+
+class CaptureRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Progress and results of a capture.
+
+    Attributes:
+        format: version of the record.
+        request: inputs of the capture.
+        done: finished steps.
+        at: step that was started last.
+        verdict: verdict of the inspection.
+        findings: findings of the inspection that are not ok.
+        pictures: label and data URI of each picture of one view.
+        files: exported files, relative to the capture's folder.
+    """
+
+    format: int
+    request: Request
+    done: tuple[Step, ...] = ()
+    at: Step | None = None
+    verdict: str = ""
+    findings: tuple[str, ...] = ()
+    pictures: tuple[tuple[str, str], ...] = ()
+    files: tuple[str, ...] = ()
+
+    def save(self, folder: Path) -> None:
+        """Write the record atomically."""
+        write_whole(folder / RECORD, to_json(msgspec.to_builtins(self)))
+
+    @staticmethod
+    def load(folder: Path) -> CaptureRecord | None:
+        """Read the record of a folder; None if the folder has none.
+
+        Raises:
+            PolarguideError: the file is not a valid record.
+        """
+        if not os.path.lexists(folder / RECORD):
+            return None
+        return read_record(folder / RECORD, CaptureRecord, remedy="Remove the folder to begin again.")
+
+    def require(self, request: Request, folder: Path) -> None:
+        """Check that the capture was started with the same request. A finished capture may lose its source.
+
+        Raises:
+            PolarguideError: the requests differ.
+        """
+        if request.stamp == NO_FILES and set(self.done) == set(STEPS):
+            return
+        ignored = {"source", "digest"}  # the content identifies files, not their location
+        if self.request.digest == request.digest != "":
+            ignored.add("stamp")
+        for name in Request.__struct_fields__:
+            require(
+                name in ignored or getattr(self.request, name) == getattr(request, name),
+                folder,
+                expected=f"the capture and options of the first start ({name})",
+                found="changed files" if name == "stamp" else "other values",
+                remedy="Remove this folder to begin again, or give another --out.",
+            )
+
+
+def prepare_settings(record: dict[str, Any]) -> PrepareSettings:
+    """Convert the record of ``PrepareSettings.record()`` back to settings."""
+    return msgspec.convert(
+        record,
+        PrepareSettings,
+        strict=False,
+        dec_hook=lambda kind, value: kind(value) if kind is Path else value,
+    )
+
+
+def source_stamp(folder: Path) -> tuple[int, int, int]:
+    """Return the number, total size in bytes and newest modification time in ns of the files below a folder.
+
+    Hidden files do not count.
+    """
+    states = []
+    for path in _files_below(folder):
+        with contextlib.suppress(OSError, ValueError):  # removed in the meantime, or an invalid name
+            states.append(os.stat(path))
+    newest = max((state.st_mtime_ns for state in states), default=0)
+    return len(states), sum(state.st_size for state in states), newest
+
+
+def source_digest(folder: Path, earlier: Request | None, stamp: tuple[int, int, int]) -> str:
+    """Return the SHA-256 of the names and contents of the files below a folder; empty without files.
+
+    Hidden files do not count.
+
+    Args:
+        folder: folder of the capture.
+        earlier: request of an earlier call. Its digest is reused if its stamp is the same.
+        stamp: current stamp of the folder.
+    """
+    if earlier is not None and earlier.stamp == stamp and earlier.digest:
+        return earlier.digest
+    digest = hashlib.sha256()
+    for path in filter(os.path.isfile, sorted(_files_below(folder))):  # reading a pipe may never end
+        with contextlib.suppress(OSError), open(path, "rb") as file:
+            digest.update(f"{canonical(os.path.relpath(path, folder))}\0".encode("utf-8", "surrogateescape"))
+            while block := file.read(1 << 20):
+                digest.update(block)
+    return "" if stamp == NO_FILES else digest.hexdigest()
+
+
+def _files_below(folder: Path) -> Iterator[str]:
+    for at, folders, names in os.walk(folder):
+        folders[:] = [name for name in folders if not name.startswith(".")]
+        yield from (os.path.join(at, name) for name in names if not name.startswith("."))
+
 
 SOURCES = Path(__file__).parents[1]
-"""The folder of all packages."""
+"""Folder of all packages."""
 PACKAGES = ("polarguide", "polarguide_shots", "polarguide_synth", "polarguide_bench")
 PROLOGUE = (
-    "import gc, sys; gc.disable(); "  # while names are imported, which stay: a fifth of the seconds
-    "sys.path[:] = [path for path in sys.path if path]; "  # what is empty is the current folder
+    "import gc, sys; gc.disable(); "  # imported names stay: a fifth of the time is saved
+    "sys.path[:] = [path for path in sys.path if path]; "  # an empty path is the current folder
     "sys.path[:0] = [path for path in sys.argv[1:] if path not in sys.path]; "
     "from polarguide_bench.worker import main; gc.enable(); sys.exit(main())"
 )
-"""What a child runs: it imports this package from where it is here, and nothing from the current folder."""
+"""Program of a child. It imports this installation of the package, and nothing from the current folder."""
 COMMAND = (sys.executable, "-c", PROLOGUE, str(SOURCES))
+"""Command line of a child."""
 
 
 @cache
 def files_digest() -> str:
-    """Sixteen hexadecimal digits that change with any byte of the code of all packages."""
+    """Return sixteen hexadecimal digits that identify the bytes of the code of all packages."""
     digest = hashlib.sha256()
     kinds = ("**/*.py", "_native.*.so", "_native.*.pyd")
     for path in sorted(path for name in PACKAGES for kind in kinds for path in (SOURCES / name).glob(kind)):
@@ -50,7 +231,7 @@ def files_digest() -> str:
 
 
 class Training(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="train"):
-    """Train a run, or go on with the one in its folder."""
+    """Task: train a run, or resume the run in its folder."""
 
     scene: str
     folder: str
@@ -61,10 +242,19 @@ class Training(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="tra
 
 
 class Scoring(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="score"):
-    """Score a finished run; with ``speed`` also time its pictures."""
+    """Task: score a finished run; with ``speed`` also measure its rendering speed."""
 
     folder: str
     speed: bool
+    compute: ComputeOptions
+
+
+class Processing(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="process"):
+    """Task: take the remaining steps of a capture."""
+
+    name: str
+    folder: str
+    request: Request
     compute: ComputeOptions
 
 
@@ -72,10 +262,12 @@ Task = Training | Scoring | Processing
 
 
 class Message(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The line that a child process reads: its task, and a digest of the code of the process that sends it.
+    """Line on the standard input of a child: a task, and digests of the sender's code.
 
     Attributes:
-        files: its ``files_digest``. code: its ``code_digest``, which takes seconds, and counts where ``files`` differs.
+        task: the task.
+        files: ``files_digest`` of the sender.
+        code: ``code_digest`` of the sender. It takes seconds to compute, and is compared only if ``files`` differs.
     """
 
     task: Task
@@ -83,17 +275,17 @@ class Message(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     code: str
 
     def to_line(self) -> bytes:
-        """The line; names of files that are no Unicode are escapes in it."""
+        """Return the message as one line of JSON. File names that are not valid Unicode become escapes."""
         return json.dumps(msgspec.to_builtins(self)).encode() + b"\n"
 
 
 class Outcome(msgspec.Struct, frozen=True):
-    """The outcome of a job on a worker.
+    """Outcome of a job on a worker.
 
     Attributes:
-        state: "done"; "failed", with the last line of its ``stderr.txt``; "lost", when it was ended from outside, so
-            that it can go on elsewhere.
-        error: that line, or how it ended.
+        state: "done", "failed", or "lost" if the child was stopped from outside. A lost job can resume on another
+            worker.
+        error: last line of ``stderr.txt``, or the exit status.
     """
 
     state: Literal["done", "failed", "lost"]
@@ -101,13 +293,14 @@ class Outcome(msgspec.Struct, frozen=True):
 
 
 POLL_SECONDS = 0.1
+"""Interval between checks of a child."""
 STDERR = "stderr.txt"
 STOPPED = 130
-"""Exit status of a child that was asked to stop."""
-FROM_OUTSIDE = tuple(-number for number in (signal.SIGTERM, getattr(signal, "SIGKILL", signal.SIGTERM)))
-"""Exit statuses of a child that somebody ended: the system for want of memory, a user, the manager of a cluster."""
+"""Exit status of a child after a request to stop."""
+KILLED = tuple(-number for number in (signal.SIGTERM, getattr(signal, "SIGKILL", signal.SIGTERM)))
+"""Exit statuses of a child that was killed: by the system for lack of memory, by a user or by a cluster's manager."""
 
-_at_work: dict[str, subprocess.Popen[bytes]] = {}
+_children: dict[str, subprocess.Popen[bytes]] = {}
 
 
 def perform(
@@ -116,12 +309,12 @@ def perform(
     *,
     gpus: Sequence[str] = (),
 ) -> Outcome:
-    """Do tasks one after the other, on a worker of dask; stop where its task is canceled.
+    """Perform tasks in turn on a worker of dask, until all are done or dask cancels the job.
 
     Args:
-        messages: the tasks, each is done in a process of its own.
-        folder: made if need be. Its ``stderr.txt`` takes what the children write.
-        gpus: GPUs of the workers of this machine, who are called 0, 1, ... and take one each, in turn.
+        messages: the tasks. Each has its own child process.
+        folder: folder for the ``stderr.txt`` of the children, created if missing.
+        gpus: GPUs of this machine. Its workers have the names 0, 1, ... and take the GPUs in turn.
     """
     from distributed import get_worker
     from distributed.worker import thread_state
@@ -130,28 +323,28 @@ def perform(
     key = thread_state.key
     device = {"CUDA_VISIBLE_DEVICES": gpus[int(worker.name) % len(gpus)]} if gpus else {}
 
-    def wanted() -> bool:
-        """Return False if the task was canceled or its command has ended."""
+    def requested() -> bool:
+        """Return False if the job was canceled or its command has ended."""
         state = worker.state.tasks.get(key)
         return state is not None and state.state != "cancelled"
 
+    outcome = Outcome("done")
     for message in messages:
         try:
-            outcome = _watched(message, Path(folder), device, key, wanted)
-        except OSError as error:  # no room, no rights, no processes: of this machine, perhaps
-            return Outcome("failed", f"{error.filename or folder}: {error.strerror or error}")
+            outcome = _run_child(message, Path(folder), device, key, requested)
+        except OSError as error:  # full disk, missing permissions, no more processes
+            outcome = Outcome("failed", f"{error.filename or folder}: {error.strerror or error}")
         if outcome.state != "done":
-            return outcome
-    return Outcome("done")
+            break
+    return outcome
 
 
-def _watched(
-    message: Message, folder: Path, device: dict[str, str], key: str, wanted: Callable[[], bool]
+def _run_child(
+    message: Message, folder: Path, device: dict[str, str], key: str, requested: Callable[[], bool]
 ) -> Outcome:
-    """One task from its begin to its end."""
     make_folder(folder)
     errors = folder / STDERR
-    errors.unlink(missing_ok=True)  # a link or a pipe, perhaps, in a folder that somebody else made
+    errors.unlink(missing_ok=True)  # it may be a link or a pipe
     with open(errors, "xb") as file:
         process = subprocess.Popen(
             COMMAND,
@@ -164,45 +357,42 @@ def _watched(
                 "OMP_NUM_THREADS": str(message.task.compute.threads),
                 **device,
             },
-            # A session of its own: Ctrl-C in the terminal reaches it through its worker alone, once. The lock of the
-            # output folder, which children of the command itself inherit, outlives a command that is killed.
+            # A new session: Ctrl-C in the terminal reaches the child only through its worker. The child inherits the
+            # lock of the output folder, so the lock outlives a killed command.
             start_new_session=True,
             close_fds=False,
         )
     assert process.stdin is not None
-    _at_work[key] = process
+    _children[key] = process
     try:
         with contextlib.suppress(BrokenPipeError):
             process.stdin.write(message.to_line())
             process.stdin.flush()
         while process.poll() is None:
-            if not wanted():
+            if not requested():
                 with contextlib.suppress(OSError):
                     process.stdin.close()
             with contextlib.suppress(subprocess.TimeoutExpired):
                 process.wait(POLL_SECONDS)
     finally:
-        del _at_work[key]
+        del _children[key]
         with contextlib.suppress(OSError):
-            process.stdin.close()  # which ends it, if anything happens here
+            process.stdin.close()  # the end of its input stops the child
     status = process.returncode
     if status == 0:
         return Outcome("done")
     lines = [line for line in errors.read_text(errors="replace").splitlines() if line.strip()]
     text = lines[-1].strip() if lines else f"the process ended with status {status}"
-    return Outcome("lost" if status == STOPPED or status in FROM_OUTSIDE else "failed", text)
+    return Outcome("lost" if status == STOPPED or status in KILLED else "failed", text)
 
 
-def _processes(keys: Sequence[str]) -> list[subprocess.Popen[bytes]]:
-    return [process for process in map(_at_work.get, keys) if process is not None]
-
-
-def count_at_work(keys: Sequence[str]) -> int:
-    """How many of the tasks still have a process on this worker."""
-    return len(_processes(keys))
+def count_running(keys: Sequence[str]) -> int:
+    """Return the number of jobs that have a process on this worker."""
+    return len(_children.keys() & set(keys))
 
 
 def kill(keys: Sequence[str]) -> None:
-    """End the processes of tasks at once; their last checkpoints stay."""
-    for process in _processes(keys):
-        process.kill()
+    """Kill the processes of jobs on this worker. Their last checkpoints remain."""
+    for key, process in list(_children.items()):
+        if key in keys:
+            process.kill()

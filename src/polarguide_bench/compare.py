@@ -1,4 +1,4 @@
-"""Train and score several recipes on several scenes, or a recipe and its ablations, and write what they score."""
+"""Train and score several recipes on several scenes, or a recipe and its ablations, and write the results."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from msgspec import UNSET
 from polarguide import __version__
 from polarguide.capture.layout import refuse_scene
 from polarguide.capture.variants import EVERY
-from polarguide.core.errors import PolarguideError
+from polarguide.core.errors import PolarguideError, require
 from polarguide.core.files import check_out, make_folder, require_inside, write_text
 from polarguide.core.options import MOST, ComputeOptions, Exposures, PathLike, check_choice, check_count
 from polarguide.core.progress import SILENT, Reporter
@@ -40,22 +40,22 @@ from polarguide_bench.plan import (
     scene_entries,
 )
 from polarguide_bench.recipes import ABLATIONS, AnyRecipe, ablations_of, recipe_named
-from polarguide_bench.record import (
+from polarguide_bench.report import exposure_svg, read_study, study_svg, write_report
+from polarguide_bench.results import (
     FORMAT,
     REMEDY,
     PartScores,
     RecipeRecord,
     Record,
+    Results,
     RunRecord,
     SceneRecord,
 )
-from polarguide_bench.report import exposure_svg, read_study, study_svg, write_report
-from polarguide_bench.results import Results
 from polarguide_bench.tables import write_tables
 
 LOCK = ".lock"
 BESIDE_OTHERS = "beside_others.txt"
-"""Marks a run folder whose training shared the machine, so that its seconds do not count."""
+"""File that marks a run whose training shared the machine, so that its time does not count."""
 
 
 def compare(
@@ -70,31 +70,31 @@ def compare(
     command_line: str = "",
     reporter: Reporter = SILENT,
 ) -> Results:
-    """Train and score every recipe on every scene with every seed, each run in processes of its own.
+    """Train and score each recipe on each scene with each seed. Each run has its own processes.
 
-    Writes ``results.json``, ``.md``, ``.csv``, ``.tex`` and ``report.html`` to ``out``, and the runs to its ``runs/``;
-    paired differences go to ``differences.csv``, scores by object and material to ``parts.csv``, where there are any;
-    with ``options.exposures``, ``exposures.svg`` has the scores over the number of pictures taken.
-    Finished runs are found again and not repeated. KeyboardInterrupt is passed on after the runs at work have saved
-    their state; the same call goes on with them.
+    Writes ``results.json``, ``.md``, ``.csv``, ``.tex`` and ``report.html`` to ``out``, and the runs to its ``runs/``.
+    Paired differences are written to ``differences.csv``, and scores by object and material to ``parts.csv``, if there
+    are any. With ``options.exposures``, ``exposures.svg`` shows the scores over the number of pictures.
+
+    Finished runs are not repeated. After a KeyboardInterrupt active runs save their states, and the same call resumes.
 
     Args:
-        scenes: scene folders with names of their own.
-        recipes: the methods in the order of the tables, by name, or as they are registered.
-        out: folder to write.
-        settings: of each training; ``seed`` is the first of ``options.seeds``. None takes 5,000 steps, since those of
-            scenes of different sizes are to be comparable; the rest as ``train`` does for every scene.
-        options: how runs are trained, timed and shown.
-        seeds_of: by the name of a recipe, how many seeds where that is not ``options.seeds``.
-        steps_of: by the name of a recipe, how many steps where that is not ``settings.steps``.
-        command_line: for the record, if not ``polarguide compare``.
+        scenes: scene folders with unique names.
+        recipes: names of the recipes, or registered recipes, in the order of the tables.
+        out: output folder.
+        settings: settings of each training. ``seed`` is the first of ``options.seeds``. The default of the steps is
+            5,000, so that scenes of different sizes are comparable. Other defaults are those of ``train``.
+        options: options for training, timing and presentation.
+        seeds_of: number of seeds by recipe, if it differs from ``options.seeds``.
+        steps_of: number of steps by recipe, if it differs from ``settings.steps``.
+        command_line: command line in the record, if it is not ``polarguide compare``.
         reporter: receives messages and progress.
 
     Returns:
-        What was written, as data frames. A run that failed is in ``runs``, with its error; the others are not affected.
+        The results as data frames. A failed run is in ``runs`` with its error, and does not affect others.
 
     Raises:
-        PolarguideError: wrong input, or another comparison at work in ``out``.
+        PolarguideError: invalid input, or another comparison is writing to ``out``.
     """
     comparison = Comparison(
         scenes=tuple(_folder(scene) for scene in scenes),
@@ -107,12 +107,11 @@ def compare(
         command_line=command_line,
     )
     names = [recipe.name for recipe in comparison.recipes]
-    for word, of, most in (("seeds_of", seeds_of, MOST_SEEDS), ("steps", steps_of, MOST)):
-        for name, count in of.items():
-            check_choice(word, name, names)
-            check_count(word, count, 1, most)
-    if not scenes:
-        raise PolarguideError("compare", expected="a scene", found="none", remedy="Name at least one scene.")
+    for option, counts, most in (("seeds_of", seeds_of, MOST_SEEDS), ("steps", steps_of, MOST)):
+        for name, count in counts.items():
+            check_choice(option, name, names)
+            check_count(option, count, 1, most)
+    require(scenes, "compare", expected="a scene", found="none", remedy="Name at least one scene.")
     check_out(comparison.out)
     refuse_scene(comparison.out)
     if options.against is not None:
@@ -145,18 +144,18 @@ def ablate(
     options: CompareOptions = CompareOptions(),
     reporter: Reporter = SILENT,
 ) -> Results:
-    """``compare`` with a recipe and its ablations; it shares runs with a comparison in the same folder.
+    """Compare a recipe with its ablations. A comparison in the same folder shares its runs.
 
-    Differences are to the recipe, unless ``options.against`` names another.
+    The recipe is the reference of the differences, unless ``options.against`` names another.
 
     Args:
-        scenes, out, settings, options, reporter: as for ``compare``.
-        base: name of the recipe whose ablations to train.
-        only: names of the ablations to take, such as without-normals; all if empty.
-        reference: recipes to add as first rows.
+        scenes, out, settings, options, reporter: see ``compare``.
+        base: name of the recipe.
+        only: names of the requested ablations, such as without-normals; all if empty.
+        reference: further recipes for the first rows.
 
     Raises:
-        PolarguideError: as ``compare``; or a recipe without ablations, or an ablation that it does not have.
+        PolarguideError: see ``compare``; or a recipe without ablations, or an unknown ablation.
     """
     recipes = [*reference, *ablated(base, only)]
     options = replace(options, against=options.against or base)
@@ -164,7 +163,6 @@ def ablate(
 
 
 def _folder(scene: object) -> Path:
-    """The folder of a scene: runs are trained in other processes, which read it from there."""
     if isinstance(scene, str | os.PathLike):
         return Path(scene)
     raise PolarguideError(
@@ -176,23 +174,23 @@ def _folder(scene: object) -> Path:
 
 
 def ablated(base: str, only: Sequence[str] = ()) -> tuple[str, ...]:
-    """The names of a recipe and of its ablations, or of those of them that are in ``only``.
+    """Return the names of a recipe and of its ablations.
 
     Args:
-        base: a recipe.
-        only: ablations with or without ``base:`` before the name; all if empty.
+        base: name of the recipe.
+        only: requested ablations with or without ``base:`` before the name; all if empty.
 
     Raises:
-        PolarguideError: a recipe without ablations, or an ablation that it does not have.
+        PolarguideError: a recipe without ablations, or an unknown ablation.
     """
     names = [recipe.name.removeprefix(f"{base}:") for recipe in ablations_of(base)]
-    if not names:
-        raise PolarguideError(
-            "base",
-            expected="a recipe with ablations: " + ", ".join(ABLATIONS),
-            found=base,
-            remedy="Take one of these, or use compare.",
-        )
+    require(
+        names,
+        "base",
+        expected="a recipe with ablations: " + ", ".join(ABLATIONS),
+        found=base,
+        remedy="Take one of these, or use compare.",
+    )
     selected = [name.removeprefix(f"{base}:") for name in only]
     for name in selected:
         check_choice("only", name, names)
@@ -200,36 +198,33 @@ def ablated(base: str, only: Sequence[str] = ()) -> tuple[str, ...]:
 
 
 def _checked_recipes(recipes: Sequence[str | AnyRecipe]) -> tuple[AnyRecipe, ...]:
-    """The recipes as they are registered: runs are trained in other processes, which know recipes by name."""
+    """Return registered recipes. Other processes train the runs and know recipes only by name."""
     registered: dict[str, AnyRecipe] = {}
     for recipe in recipes:
         own = recipe_named(recipe if isinstance(recipe, str) else recipe.name)
-        if not isinstance(recipe, str) and recipe != own:
-            raise PolarguideError(
-                "recipes",
-                expected=f"the registered recipe {own.name}",
-                found="a recipe of this name with other values",
-                remedy="Give it another name, and register it under the entry points polarguide.recipes.",
-            )
-        if own.name in registered:
-            raise PolarguideError(
-                "recipes",
-                expected="no name more than once",
-                found=f"{own.name} twice",
-                remedy="Name each once.",
-            )
-        registered[own.name] = own
-    if not registered:
-        raise PolarguideError(
-            "compare", expected="a recipe", found="none", remedy="Name at least one recipe."
+        require(
+            isinstance(recipe, str) or recipe == own,
+            "recipes",
+            expected=f"the registered recipe {own.name}",
+            found="a recipe of this name with other values",
+            remedy="Give it another name, and register it under the entry points polarguide.recipes.",
         )
+        require(
+            own.name not in registered,
+            "recipes",
+            expected="no name more than once",
+            found=f"{own.name} twice",
+            remedy="Name each once.",
+        )
+        registered[own.name] = own
+    require(registered, "compare", expected="a recipe", found="none", remedy="Name at least one recipe.")
     return tuple(registered.values())
 
 
 def _train(
     comparison: Comparison, scenes: Sequence[SceneEntry], plan: Sequence[PlannedRun], reporter: Reporter
 ) -> dict[Path, str]:
-    """Train and score what is missing; the last words of what failed, by run folder."""
+    """Train and score unfinished runs, and return the errors by run folder."""
     unfinished = [run for run in plan if run.state() != "done"]
     reporter.say(f"runs: {len(plan)}, of them finished before: {len(plan) - len(unfinished)}")
     failures: dict[Path, str] = {}
@@ -253,19 +248,19 @@ def _train(
         ) as at:
             run_jobs(jobs, at, reporter=reporter, on_end=end)
     except KeyboardInterrupt:
-        reporter.say("The runs at work have saved their state: the same comparison goes on with them.")
+        reporter.say("Active runs have saved their states. Give the same command again to resume.")
         raise
     return failures
 
 
 def _job(comparison: Comparison, run: PlannedRun, *, alone: bool) -> Job:
-    """The tasks that finish a run."""
+    """Return the job that finishes a run. It measures the speed if it is ``alone`` on the machine."""
     compute = ComputeOptions(comparison.options.threads, comparison.options.device)
     folder = str(run.folder.absolute())
     training = Training(
         scene=str(run.scene.path.absolute()),
         folder=folder,
-        recipe=run.recipe.name,
+        recipe=run.row.recipe.name,
         settings=run.settings,
         reading=run.reading,
         compute=compute,
@@ -277,39 +272,35 @@ def _job(comparison: Comparison, run: PlannedRun, *, alone: bool) -> Job:
             return (scoring,)
         if not alone:
             make_folder(run.folder)
-            write_text(run.folder / BESIDE_OTHERS, "Trained beside other runs: its seconds do not count.\n")
+            write_text(run.folder / BESIDE_OTHERS, "Trained next to other runs: its time does not count.\n")
         return (training, scoring)
 
     return run_job(run.label, run.folder, tasks, run.steps)
 
 
 def _time(comparison: Comparison, plan: Sequence[PlannedRun], reporter: Reporter) -> None:
-    """Time the pictures of finished runs that have not been timed alone, one after the other."""
-    untimed = [run for run in plan if (record := run.metrics()) is not None and record["fps"] is None]
+    """Measure the rendering speed of finished runs that have none, one run at a time."""
+
+    def speed(run: PlannedRun) -> float | None:
+        return (run.metrics() or {}).get("fps")
+
+    untimed = [run for run in plan if run.state() == "done" and speed(run) is None]
     if not untimed:
         return
-    reporter.say(f"timing the pictures of {len(untimed)} runs, one after the other")
-    jobs = [_timing(comparison, run) for run in untimed]
+    reporter.say(f"measuring the rendering speed of {len(untimed)} runs, one at a time")
     options = comparison.options
     gpus = own_gpus(choose_backend(options.device))
     with workers(options, count=1, threads=options.threads, memory=0, gpus=gpus, reporter=reporter) as at:
-        run_jobs(jobs, at, reporter=reporter)
-    missed = [run for run in untimed if (record := run.metrics()) is None or record["fps"] is None]
+        run_jobs([_job(comparison, run, alone=True) for run in untimed], at, reporter=reporter)
+    missed = sum(speed(run) is None for run in untimed)
     if missed:
-        reporter.warn(f"no speed for {len(missed)} runs: they failed, or were not alone on the machine.")
-
-
-def _timing(comparison: Comparison, run: PlannedRun) -> Job:
-    """Score a run again, with its speed."""
-    compute = ComputeOptions(comparison.options.threads, comparison.options.device)
-    scoring = Scoring(str(run.folder.absolute()), True, compute)
-    return run_job(run.label, run.folder, lambda: (scoring,), run.steps)
+        reporter.warn(f"no speed for {missed} runs: they failed, or were not alone on the machine.")
 
 
 def locked(folder: Path, what: str = "comparison") -> contextlib.AbstractContextManager[None]:
-    """Keep two comparisons (or two of something else) out of an existing folder.
+    """Lock an existing folder against other comparisons, or other work of the same kind.
 
-    Children on this machine inherit the lock and hold it if the parent is killed, until they have saved their state.
+    Children on this machine inherit the lock. If the parent is killed, they hold it until they have saved their states.
     """
     return only_writer(
         folder / LOCK, expected="a folder that nobody is writing to", found=f"another {what} at work in it"
@@ -322,11 +313,13 @@ def collect(
     plan: Sequence[PlannedRun],
     failures: Mapping[Path, str],
 ) -> Results:
-    """The results of a comparison as far as its runs are.
+    """Return the results of the runs that are finished at this time.
 
     Args:
-        comparison, scenes, plan: the requested comparison.
-        failures: last words of runs that failed, by their folders.
+        comparison: the requested comparison.
+        scenes: its scenes.
+        plan: its runs.
+        failures: errors of failed runs by their folders.
     """
     options = comparison.options
     settings = comparison.settings
@@ -418,7 +411,7 @@ def _run_record(comparison: Comparison, run: PlannedRun, failure: str | None) ->
 
 
 def _write_charts(comparison: Comparison, scenes: Sequence[SceneEntry], results: Results) -> None:
-    """Write ``study.svg`` of a family of scenes, and ``exposures.svg`` of several kinds of captures."""
+    """Write ``study.svg`` for a family of scenes, and ``exposures.svg`` for several kinds of captures."""
     drawn = {"study.svg": study_svg(results, {scene.name: read_study(scene.path) for scene in scenes})}
     if len(comparison.options.exposures) > 1:
         counts = {
@@ -433,9 +426,15 @@ def _write_charts(comparison: Comparison, scenes: Sequence[SceneEntry], results:
 
 
 def count_of(exposures: Exposures, views: int) -> int:
-    """How many pictures ``select_exposures`` leaves of a number of training views with four each."""
-    each = {"three": 3, "two": 2, "one": 1, "unknown": 1, "none": 1}
+    """Return the number of pictures that ``select_exposures`` leaves of training views with four pictures each."""
     fourth = -(-views // EVERY)
-    if exposures == "mixed":
-        return views + 3 * fourth
-    return 4 * fourth if exposures == "sparse" else each.get(exposures, 4) * views
+    counts = {
+        "three": 3 * views,
+        "two": 2 * views,
+        "one": views,
+        "unknown": views,
+        "none": views,
+        "mixed": views + 3 * fourth,
+        "sparse": 4 * fourth,
+    }
+    return counts.get(exposures, 4 * views)

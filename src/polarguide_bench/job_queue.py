@@ -1,7 +1,7 @@
-"""Jobs on workers of dask.distributed: handed out in order, watched, resumed after a loss, and stopped without loss.
+"""Jobs on workers of dask.distributed, with progress, resume after a loss, and a stop that saves their states.
 
-Workers are on this machine, behind a scheduler that runs already, or jobs of SLURM or PBS. dask is imported where
-workers are needed, since importing it takes a while.
+Workers run on this machine, behind a running scheduler, or as jobs of SLURM or PBS. The functions that need dask
+import it, because the import is slow.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import msgspec
 
-from polarguide.core.errors import PolarguideError, optional_import
+from polarguide.core.errors import PolarguideError, optional_import, require
 from polarguide.core.options import LOOPBACK
 from polarguide.core.progress import Advance, Reporter
 from polarguide.core.system import MEBIBYTE
@@ -31,7 +31,7 @@ from polarguide_bench.children import (
     Message,
     Outcome,
     Task,
-    count_at_work,
+    count_running,
     files_digest,
     kill,
     perform,
@@ -42,32 +42,33 @@ if TYPE_CHECKING:
     from distributed import Client, Future
 
 NOWHERE = f"{LOOPBACK[0]}:0"
-"""Where dask's web servers listen, which cannot be turned off: on the loopback alone, at any free port."""
+"""Address of dask's web servers, which cannot be disabled: any free port of the loopback interface."""
 WORKER_BYTES = 300_000_000
-"""Memory of a worker of dask and its nanny, beside the process that it starts."""
+"""Memory of a worker of dask and its nanny, without the child process."""
 CONNECT_SECONDS = 30.0
-"""How long a scheduler that somebody else runs may take to answer."""
+"""Timeout of the connection to a running scheduler."""
 SETTINGS = {
-    # A lost worker is reported at once: run_jobs decides whether the job goes on.
+    # The scheduler reports a lost worker at once: run_jobs decides whether the job resumes.
     "distributed.scheduler.allowed-failures": 0,
     "distributed.deploy.lost-worker-timeout": "2s",
     "distributed.worker.memory.terminate": False,
     "distributed.worker.memory.pause": False,
-    # Nobody measures, and nothing is reported to anyone.
+    # No profiling, and little monitoring.
     "distributed.worker.profile.enabled": False,
     "distributed.admin.tick.interval": "1s",
     "distributed.admin.system-monitor.interval": "10s",
 }
+"""Settings of dask."""
 
 
 @dataclass
 class Workers:
-    """Worker processes, of which lost ones are replaced.
+    """Worker processes. Lost workers are replaced.
 
     Attributes:
-        client: connection to their scheduler.
-        most: largest number of jobs at a time. Lost workers are replaced up to it.
-        gpus: GPUs of this machine that each worker in turn sees; empty: every worker sees all.
+        client: connection to the scheduler.
+        most: largest number of simultaneous jobs, and of workers.
+        gpus: GPUs of this machine that its workers use in turn. If empty, each worker uses all.
     """
 
     client: Client
@@ -76,11 +77,11 @@ class Workers:
     _cluster: Any = field(default=None, repr=False)
 
     def slots(self) -> int:
-        """How many jobs have room now."""
+        """Return the number of jobs that the present workers can run."""
         return sum(self.client.nthreads().values())
 
     def replace_lost(self) -> None:
-        """Ask for as many workers as at the beginning, where some were lost."""
+        """Request new workers for lost ones."""
         if self._cluster is not None:
             self._cluster.scale(self.most)
 
@@ -89,21 +90,23 @@ class Workers:
 def workers(
     options: ClusterOptions, *, count: int, threads: int, memory: int, gpus: Sequence[str], reporter: Reporter
 ) -> Iterator[Workers]:
-    """Workers as the options say, for as long as the context is open.
+    """Start or connect workers, and stop them at the end of the context.
 
     Args:
-        options: where.
-        count: how many jobs work at a time. threads: threads of each. memory: bytes that each takes at most.
+        options: place of the workers.
+        count: number of simultaneous jobs.
+        threads: threads of each job.
+        memory: upper bound of the memory of each job in bytes.
         gpus: GPUs of this machine, for local workers.
-        reporter: is told where workers are.
+        reporter: receives a message about the workers.
 
     Raises:
-        PolarguideError: there is no such scheduler, or dask-jobqueue or the commands of its manager are missing.
+        PolarguideError: no such scheduler, or dask-jobqueue or a command of the cluster's manager is missing.
     """
     import dask
     from distributed import Client, LocalCluster
 
-    # run_jobs reports what matters. Each logger has a level of its own.
+    # run_jobs reports failures itself. Each logger has its own level.
     for name in ("distributed", "distributed.client"):
         logging.getLogger(name).setLevel(logging.CRITICAL)
     with dask.config.set(SETTINGS), contextlib.ExitStack() as stack:
@@ -116,11 +119,11 @@ def workers(
             cluster = stack.enter_context(_queued(options.manager, count, threads, memory))
             client = stack.enter_context(Client(cluster))
             reporter.say(
-                f"{options.manager}: asked for {count} jobs of {threads} cores and {_mib(memory)} MiB"
+                f"{options.manager}: {count} jobs of {threads} cores and {_mib(memory)} MiB requested"
             )
             yield Workers(client, count, _cluster=cluster)
             return
-        # In this process, since each job has one of its own: nothing listens, and nothing has to be started.
+        # Local workers are threads of this process, since each job has its own process. They open no port.
         cluster = stack.enter_context(
             LocalCluster(
                 n_workers=count,
@@ -136,7 +139,7 @@ def workers(
 
 
 def _connected(address: str) -> Client:
-    """A client of a scheduler that runs already."""
+    """Return a client of a running scheduler."""
     from distributed import Client
 
     try:
@@ -151,38 +154,38 @@ def _connected(address: str) -> Client:
 
 
 def _queued(manager: str, count: int, threads: int, memory: int) -> Any:
-    """Workers as jobs of SLURM or PBS, replaced by others when they end.
+    """Return a cluster whose workers are jobs of SLURM or PBS.
 
-    Queue, account, time and whatever else a site wants are read from dask's own configuration (jobqueue.yaml).
+    dask reads queue, account, time and other settings of the site from its configuration (jobqueue.yaml).
     """
     import dask
 
-    of = f"jobqueue.{manager}"
     managers: dict[str, tuple[str, str, dict[str, Any]]] = {
         "slurm": ("sbatch", "SLURMCluster", {"job_cpu": threads}),
         "pbs": ("qsub", "PBSCluster", {"resource_spec": f"select=1:ncpus={threads}:mem={_mib(memory)}MB"}),
     }
-    submit, kind, extra = managers[manager]
+    submit, kind, resources = managers[manager]
     if shutil.which(submit) is None:
         raise _no_cluster(manager, f"no command {submit}")
     jobqueue = optional_import("dask_jobqueue", f"--{manager}")
+    site = f"jobqueue.{manager}"
     try:
         return getattr(jobqueue, kind)(
-            n_workers=count,  # waits until the jobs are accepted
+            n_workers=count,  # waits until the manager accepts the jobs
             cores=1,
             processes=1,
             memory=f"{_mib(memory)} MiB",
             scheduler_options={
                 "dashboard_address": NOWHERE,
-                **(dask.config.get(f"{of}.scheduler-options", None) or {}),
+                **(dask.config.get(f"{site}.scheduler-options", None) or {}),
             },
             worker_extra_args=[
-                *(dask.config.get(f"{of}.worker-extra-args", None) or []),
+                *(dask.config.get(f"{site}.worker-extra-args", None) or []),
                 "--dashboard-address",
                 NOWHERE,
             ],
             silence_logs=logging.CRITICAL,
-            **extra,
+            **resources,
         )
     except (OSError, ValueError, RuntimeError, AssertionError) as error:
         reasons = [line for line in str(error.__context__ or error).splitlines() if line.strip()]
@@ -192,35 +195,36 @@ def _queued(manager: str, count: int, threads: int, memory: int) -> Any:
 def _no_cluster(manager: str, found: str) -> PolarguideError:
     return PolarguideError(
         f"--{manager}",
-        expected="a cluster that takes jobs from this machine",
+        expected="a cluster that accepts jobs from this machine",
         found=found,
-        remedy="Run it where jobs are submitted; docs/how-to/cluster.md says what to configure.",
+        remedy="Run the command on a machine that can submit jobs. docs/how-to/cluster.md describes the configuration.",
     )
 
 
 def _mib(memory: int) -> int:
-    """Return the memory of a job in MiB: that of its process and of its worker."""
+    """Return the memory of a job with its worker in MiB."""
     return math.ceil((memory + WORKER_BYTES) / MEBIBYTE)
 
 
-ASK_SECONDS = 1.0
-"""Between two questions to the scheduler, who may be far away."""
+SLOTS_SECONDS = 1.0
+"""Interval between queries of a scheduler, which may be remote."""
 TAIL_BYTES = 4096
+"""Size of the end of a log that is searched for its last row."""
 MOST_LOSSES = 10
-"""Times in a row that a job may be lost without having saved anything: it takes more memory than there is, perhaps."""
+"""Largest number of consecutive losses of a job without a new checkpoint. Its memory may not suffice."""
 
 
 @dataclass(frozen=True)
 class Job:
-    """Tasks to do one after the other, each in a process of its own.
+    """Tasks that one worker performs in turn.
 
     Attributes:
-        label: what messages call it.
-        folder: made if need be. Its ``stderr.txt`` takes what the processes write.
-        tasks: what is still to do, by what the folder holds: called whenever the job is begun or gone on with.
-        total: how much there is to do, as ``progress`` counts it.
-        progress: how much is done, and a few words on that.
-        saved: files that are written anew whenever there is something new to go on from.
+        label: name in messages.
+        folder: folder for the ``stderr.txt`` of the processes, created if missing.
+        tasks: returns the remaining tasks according to the folder. It is called at each start and resume.
+        total: amount of work, in the unit of ``progress``.
+        progress: returns the finished amount of work and a short note.
+        saved: files that change with each saved state.
     """
 
     label: str
@@ -232,7 +236,7 @@ class Job:
 
 
 def run_job(label: str, run: Path, tasks: Callable[[], Sequence[Task]], steps: int) -> Job:
-    """The job that trains and scores a run of so many steps; see ``Job``."""
+    """Return the job that trains and scores a run; see ``Job``."""
 
     def progress() -> tuple[int, str]:
         step, note = training_progress(run, steps)
@@ -242,7 +246,7 @@ def run_job(label: str, run: Path, tasks: Callable[[], Sequence[Task]], steps: i
 
 
 def training_progress(run: Path, steps: int) -> tuple[int, str]:
-    """How many steps of a training are done, as its log says, and what it says of the last."""
+    """Return the number of finished training steps and a note about the last one, read from the log."""
     row = last_row(run / LOG)
     if row is None or row.psnr is None:
         return 0, ""
@@ -251,8 +255,8 @@ def training_progress(run: Path, steps: int) -> tuple[int, str]:
 
 
 @dataclass(frozen=True)
-class _Active:
-    """A job that was handed to a worker. ``advance`` moves its bar, which ``bar`` closes."""
+class _ActiveJob:
+    """A job on a worker. ``advance`` updates its progress bar; ``bar`` closes it."""
 
     job: Job
     future: Future
@@ -261,27 +265,23 @@ class _Active:
 
 
 class _Progress:
-    """Progress of many jobs: one bar for all, and one for each running job."""
+    """Progress bars: one for all jobs, and one for each active job."""
 
     def __init__(self, jobs: Sequence[Job], reporter: Reporter, stack: contextlib.ExitStack) -> None:
-        self._jobs = {job.folder: job for job in jobs}
         self._done = {job.folder: job.progress()[0] for job in jobs}
-        self._ended = 0
         self._all = stack.enter_context(reporter.track("all", sum(job.total for job in jobs)))
 
-    def report(self, active: Sequence[_Active], slots: int) -> None:
-        """How far all and each of them are."""
+    def report(self, active: Sequence[_ActiveJob], waiting: int, slots: int) -> None:
+        """Update all bars."""
         for each in active:
             done, note = each.job.progress()
             each.advance(done, note=note)
             self._done[each.job.folder] = done
-        waits = "" if slots else "  waiting for a worker"
-        note = f"{self._ended} of {len(self._jobs)} ended{waits}"
-        self._all(sum(self._done.values()), note=note)
+        ended = f"{len(self._done) - len(active) - waiting} of {len(self._done)} ended"
+        self._all(sum(self._done.values()), note=ended if slots else f"{ended}  waiting for a worker")
 
     def end(self, job: Job) -> None:
-        """Count a job that has ended."""
-        self._ended += 1
+        """Count a job as finished."""
         self._done[job.folder] = job.total
 
 
@@ -292,60 +292,56 @@ def run_jobs(
     reporter: Reporter,
     on_end: Callable[[Job, str | None], None] = lambda job, error: None,
 ) -> None:
-    """Work through jobs. One that fails takes no other down; one whose process or worker is lost goes on elsewhere.
+    """Run jobs on workers. A failed job does not affect others; a lost job resumes on another worker.
 
     Args:
-        jobs: what to do, in this order.
-        workers: who does it, one job each at a time.
+        jobs: the jobs in their order.
+        workers: workers with one job each at a time.
         reporter: receives progress, and a line at the end of each job.
-        on_end: called after each job, with its error or None.
+        on_end: called after each job with its error or None.
 
     Raises:
-        KeyboardInterrupt: raised meanwhile, as by Ctrl-C; passed on when all children have stopped.
-        PolarguideError: the scheduler has gone.
+        KeyboardInterrupt: Ctrl-C; raised again after all children have stopped.
+        PolarguideError: the connection to the scheduler was lost.
     """
     waiting = deque(jobs)
-    active = list[_Active]()
+    active = list[_ActiveJob]()
     losses: dict[Path, tuple[int, int]] = {}
     with contextlib.ExitStack() as stack:
         progress = _Progress(jobs, reporter, stack)
         slots = workers.slots()
-        asked_at = time.monotonic()
+        queried = time.monotonic()
         try:
             while waiting or active:
                 while waiting and len(active) < max(1, min(slots, workers.most)):
-                    active.append(_handed_out(waiting.popleft(), workers, reporter, stack))
+                    active.append(_submit(waiting.popleft(), workers, reporter, stack))
                 for each in [each for each in active if each.future.done()]:
+                    job = each.job
                     outcome = _outcome_of(each.future)
                     active.remove(each)
                     each.bar.close()
-                    if outcome.state == "lost" and not _lost_too_often(each.job, losses):
-                        reporter.say(
-                            f"lost  {each.job.label}: {outcome.error}; it goes on from what it has saved"
-                        )
-                        waiting.appendleft(each.job)
+                    if outcome.state == "lost" and not _is_last_loss(job, losses):
+                        reporter.say(f"lost  {job.label}: {outcome.error}; resuming from its last checkpoint")
+                        waiting.appendleft(job)
                         continue
                     error = None if outcome.state == "done" else outcome.error
                     if error is None:
-                        (each.job.folder / STDERR).unlink(missing_ok=True)
-                    progress.end(each.job)
-                    words = (
-                        f"done  {each.job.label}" if error is None else f"failed  {each.job.label}: {error}"
-                    )
-                    reporter.say(words)
-                    on_end(each.job, error)
-                progress.report(active, slots)
+                        (job.folder / STDERR).unlink(missing_ok=True)
+                    progress.end(job)
+                    reporter.say(f"done  {job.label}" if error is None else f"failed  {job.label}: {error}")
+                    on_end(job, error)
+                progress.report(active, len(waiting), slots)
                 time.sleep(POLL_SECONDS)
-                if time.monotonic() - asked_at > ASK_SECONDS:
+                if time.monotonic() - queried > SLOTS_SECONDS:
                     slots = workers.slots()
-                    asked_at = time.monotonic()
+                    queried = time.monotonic()
                     workers.replace_lost()
-        except BaseException:  # whatever happens here, no child goes on unwatched
+        except BaseException:  # no child may continue without supervision
             _stop([each.future for each in active], workers.client)
             raise
 
 
-def _handed_out(job: Job, workers: Workers, reporter: Reporter, stack: contextlib.ExitStack) -> _Active:
+def _submit(job: Job, workers: Workers, reporter: Reporter, stack: contextlib.ExitStack) -> _ActiveJob:
     future = workers.client.submit(
         perform,
         tuple(Message(task, files_digest(), code_digest()) for task in job.tasks()),
@@ -355,24 +351,24 @@ def _handed_out(job: Job, workers: Workers, reporter: Reporter, stack: contextli
         pure=False,
     )
     bar = stack.enter_context(contextlib.ExitStack())
-    return _Active(job, future, bar.enter_context(reporter.track(job.label, job.total)), bar)
+    return _ActiveJob(job, future, bar.enter_context(reporter.track(job.label, job.total)), bar)
 
 
 def _outcome_of(future: Future) -> Outcome:
-    """The outcome of a job that has ended.
+    """Return the outcome of a finished job.
 
     Raises:
-        PolarguideError: the scheduler has gone.
+        PolarguideError: the connection to the scheduler was lost.
     """
     from distributed import KilledWorker
 
-    if future.cancelled():
-        raise PolarguideError(
-            "scheduler",
-            expected="a scheduler until the end",
-            found="that the connection to it was lost",
-            remedy="The same command goes on, once there is a scheduler.",
-        )
+    require(
+        not future.cancelled(),
+        "scheduler",
+        expected="a scheduler until the end",
+        found="a lost connection",
+        remedy="Give the same command again when a scheduler is running. It resumes.",
+    )
     error = future.exception() if future.status == "error" else None
     if isinstance(error, KilledWorker):
         return Outcome("lost", "its worker has gone")
@@ -382,11 +378,12 @@ def _outcome_of(future: Future) -> Outcome:
     return outcome
 
 
-def _lost_too_often(job: Job, losses: dict[Path, tuple[int, int]]) -> bool:
-    """Count one more loss; whether it is the last.
+def _is_last_loss(job: Job, losses: dict[Path, tuple[int, int]]) -> bool:
+    """Count a loss of a job, and return True if it has no more retries.
 
     Args:
-        losses: by the folder of a job, when anything was saved, and losses since.
+        job: the lost job.
+        losses: modification time of the last saved state, and the losses since, by the folder of a job.
     """
     saved = max((path.stat().st_mtime_ns for path in job.saved if path.exists()), default=0)
     before, count = losses.get(job.folder, (saved, 0))
@@ -395,19 +392,19 @@ def _lost_too_often(job: Job, losses: dict[Path, tuple[int, int]]) -> bool:
 
 
 def _stop(futures: Sequence[Future], client: Client) -> None:
-    """Cancel all, and wait until their processes have ended; a second Ctrl-C kills these."""
+    """Cancel jobs and wait for the end of their processes. A second Ctrl-C kills the processes."""
     keys = [future.key for future in futures]
-    with contextlib.suppress(Exception):  # the scheduler may be what has gone
+    with contextlib.suppress(Exception):  # the scheduler may have failed itself
         client.cancel(futures, force=True)
         try:
-            while any(client.run(count_at_work, keys).values()):
+            while any(client.run(count_running, keys).values()):
                 time.sleep(POLL_SECONDS)
         except KeyboardInterrupt:
             client.run(kill, keys)
 
 
 class LogRow(msgspec.Struct):
-    """A line of a log, as far as progress shows it."""
+    """Fields of a row of a log that progress shows."""
 
     step: Annotated[int, msgspec.Meta(ge=0)]
     psnr: float | None = None
@@ -418,9 +415,9 @@ _ROWS = msgspec.json.Decoder(LogRow)
 
 
 def last_row(log: Path) -> LogRow | None:
-    """The last whole line of a log, or None where there is none yet."""
+    """Return the last complete row of a log; None without one."""
     try:
-        if not log.is_file():  # a pipe would never end
+        if not log.is_file():  # reading a pipe may never end
             return None
         with open(log, "rb") as file:
             file.seek(max(0, log.stat().st_size - TAIL_BYTES))
@@ -428,6 +425,6 @@ def last_row(log: Path) -> LogRow | None:
     except OSError:
         return None
     for line in reversed(lines):
-        with contextlib.suppress(ValueError, RecursionError):  # empty, half written, or cut by the seek
+        with contextlib.suppress(ValueError, RecursionError):  # an empty or incomplete line
             return _ROWS.decode(line)
     return None

@@ -1,4 +1,4 @@
-"""Options of a comparison and of the bench, and the bench as data. Does not import torch."""
+"""Options of comparisons, batches and the bench, and the bench as data. This module does not import torch."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Literal
 
-from polarguide.core.errors import PolarguideError
+from polarguide.core.errors import require
 from polarguide.core.options import (
     EXPOSURES,
     MOST_THREADS,
@@ -21,7 +21,7 @@ from polarguide.training.settings import TrainSettings
 from polarguide_synth.settings import SynthSettings
 
 MOST_SEEDS = 1000
-"""Each is a run of its own for every recipe and scene."""
+"""Largest number of seeds. Each recipe and scene has a run for each seed."""
 Manager = Literal["slurm", "pbs"]
 LayoutName = Literal["publication-1", "publication-2"]
 """Tables of PolarGuide-GSDR: its comparison of methods, and its ablations."""
@@ -29,16 +29,16 @@ LayoutName = Literal["publication-1", "publication-2"]
 
 @dataclass(frozen=True)
 class ClusterOptions:
-    """Where runs are trained.
+    """Place of the computation.
 
     Attributes:
-        jobs: Runs at a time; 0 takes as many as this machine has cores, memory and GPUs for, and with a cluster as many
-            as there are. Times are measured only with 1, on this machine.
+        jobs: Number of simultaneous runs. 0 uses the cores, memory and GPUs of this machine, or all jobs at once on a
+            cluster. Times are measured only with 1 on this machine.
         threads: Threads of each run.
-        scheduler: Address of a scheduler of dask.distributed, such as tcp://10.0.0.5:8786: its workers train. They need
-            the same folders and the same version.
-        slurm: Let jobs of SLURM train; dask's jobqueue.yaml has queue, account and time.
-        pbs: The same with PBS.
+        scheduler: Address of a scheduler of dask.distributed, such as tcp://10.0.0.5:8786. Its workers need the same
+            folders and the same version.
+        slurm: Run jobs on SLURM. dask's jobqueue.yaml configures queue, account and time.
+        pbs: Run jobs on PBS. dask's jobqueue.yaml configures queue, account and time.
     """
 
     jobs: int = 0
@@ -50,35 +50,40 @@ class ClusterOptions:
     def __post_init__(self) -> None:
         check_count("jobs", self.jobs, 0, MOST_THREADS)
         check_count("threads", self.threads, 1, MOST_THREADS)
-        named = [f"--{name}" for name in ("scheduler", "slurm", "pbs") if getattr(self, name)]
-        if len(named) > 1:
-            raise PolarguideError(
-                named[1], expected="one place to train at", found=" and ".join(named), remedy="Leave one out."
-            )
+        places = [f"--{name}" for name in ("scheduler", "slurm", "pbs") if getattr(self, name)]
+        require(
+            len(places) <= 1,
+            places[-1] if places else "",
+            expected="one place of the computation",
+            found=" and ".join(places),
+            remedy="Leave one out.",
+        )
 
     @property
     def manager(self) -> Manager | None:
-        """Whose jobs train."""
-        return "slurm" if self.slurm else "pbs" if self.pbs else None
+        """Manager of the cluster, if any."""
+        if self.slurm:
+            return "slurm"
+        return "pbs" if self.pbs else None
 
     @property
     def local(self) -> bool:
-        """Whether this machine trains."""
+        """True if this machine computes."""
         return self.scheduler is None and self.manager is None
 
 
 @dataclass(frozen=True)
 class CompareOptions(ClusterOptions, SceneOptions):
-    """How runs are trained, timed and shown.
+    """Options for training, timing and presentation of runs.
 
     Attributes:
         seeds: Number of seeds. 3 trains each recipe with the seeds 0, 1 and 2, and tables show mean and spread.
         speed: Measure the rendering speed of each run after all trainings, one run at a time. Runs that were already
             measured without other work on the machine are not measured again.
         report_views: Test views of each scene in the report; 0 leaves the pictures out.
-        device: The device of trainings and renderings.
+        device: Device of trainings and renderings.
         against: Reference recipe. Tables show the difference of every other recipe to it.
-        exposures: Ways to capture, a row of the tables each, imitated with a scene of four pictures a view.
+        exposures: Kinds of captures, a row of the tables each, simulated from a scene with four pictures of each view.
             four: all four. three: 0, 60 and 120 degrees. two: two at right angles. one: one. unknown: one, at an
             unknown angle. mixed: four of every fourth view, the others without a filter. sparse: every fourth view
             alone. none: no filter, and no polarization in the recipe.
@@ -95,35 +100,32 @@ class CompareOptions(ClusterOptions, SceneOptions):
         ClusterOptions.__post_init__(self)
         SceneOptions.__post_init__(self)
         check_count("seeds", self.seeds, 1, MOST_SEEDS)
-        if self.speed and not self.local:
-            raise PolarguideError(
-                "speed",
-                expected="this machine, where nothing else runs meanwhile",
-                found="a cluster",
-                remedy="Leave it out, and repeat the command with --speed, without the cluster, when all is trained.",
-            )
+        require(
+            self.local or not self.speed,
+            "speed",
+            expected="this machine without other work",
+            found="a cluster",
+            remedy="Leave it out. After all trainings repeat the command with --speed and without the cluster.",
+        )
         check_count("report_views", self.report_views, 0)
         for name in self.exposures:
             check_choice("exposures", name, EXPOSURES)
-        if len(set(self.exposures)) < len(self.exposures):
-            kinds = " ".join(self.exposures)
-            raise PolarguideError(
-                "exposures", expected="every word once", found=kinds, remedy="Name each once."
-            )
-
-    @property
-    def own_device(self) -> DeviceName:
-        """The device on which this machine renders for the report, if others train."""
-        return self.device if self.local else "auto"
+        require(
+            len(set(self.exposures)) == len(self.exposures),
+            "exposures",
+            expected="different kinds",
+            found=" ".join(self.exposures),
+            remedy="Name each once.",
+        )
 
 
 @dataclass(frozen=True)
 class BatchOptions(ClusterOptions):
-    """How captures are processed.
+    """Options for processing captures.
 
     Attributes:
-        formats: What to export of each: ply, spz, sog, mesh, points, environment or cameras.
-        device: The device of trainings and renderings.
+        formats: Export formats: ply, spz, sog, mesh, points, environment or cameras.
+        device: Device of trainings and renderings.
     """
 
     formats: tuple[ExportFormat, ...] = ("ply",)
@@ -135,14 +137,15 @@ Half = Literal["development", "held-back"]
 
 @dataclass(frozen=True)
 class Bench:
-    """A fixed set of rendered scenes and of rows to compare on them.
+    """A fixed set of rendered scenes, and of rows to compare on them.
 
     Attributes:
-        development: presets or scene files that methods are developed beside.
-        held_back: those that nobody tunes on.
-        synth, views: how each is rendered.
-        rows: names of recipes in the order of the tables, and how many seeds each is trained with.
-        training: settings of every training; the first seed, from which others count up.
+        development: presets or scene files for the development of methods.
+        held_back: presets or scene files that must not be used for tuning.
+        synth: settings of the rendering.
+        views: views of each scene.
+        rows: names of recipes in the order of the tables, and the number of seeds of each.
+        training: settings of each training, with the first seed.
     """
 
     development: tuple[str, ...]
@@ -151,10 +154,6 @@ class Bench:
     views: int
     rows: Mapping[str, int]
     training: TrainSettings
-
-    def scenes(self, half: Half) -> tuple[str, ...]:
-        """The scenes of a half."""
-        return self.held_back if half == "held-back" else self.development
 
 
 BENCH = Bench(
@@ -178,19 +177,19 @@ BENCH = Bench(
     },
     training=TrainSettings(steps=2500, seed=0, refractive_index=1.5),
 )
-"""Numbers of different benches are not comparable: a change here makes all published tables old."""
+"""The bench of the published tables. Results of a changed bench are not comparable with them."""
 
 
 @dataclass(frozen=True)
 class BenchOptions(ClusterOptions):
-    """Which part of the bench to run, and on what.
+    """Part of the bench, and place of the computation.
 
     Attributes:
-        held_back: The held-back half in place of the development half: once, at the end of a change that claims
-            something. Nobody tunes on it.
-        render_only: Render the scenes and train nothing.
-        scenes: Some scenes of the half; all if none is given. Rendering takes the threads of all runs together.
-        device: The device of trainings and renderings.
+        held_back: Use the held-back half instead of the development half, once for the final result of a change. It
+            must not be used for tuning.
+        render_only: Render the scenes without training.
+        scenes: Scenes of the half; all if none is given. The rendering uses the threads of all runs together.
+        device: Device of trainings and renderings.
     """
 
     held_back: bool = False
@@ -198,33 +197,30 @@ class BenchOptions(ClusterOptions):
     scenes: tuple[str, ...] = ()
     device: DeviceName = "auto"
 
-    def __post_init__(self) -> None:
-        self.comparing(1)
-
     @property
     def half(self) -> Half:
-        """The requested half."""
+        """Requested half."""
         return "held-back" if self.held_back else "development"
 
     def comparing(self, seeds: int) -> CompareOptions:
-        """The options of the comparison."""
-        where = {field.name: getattr(self, field.name) for field in fields(ClusterOptions)}
-        return CompareOptions(**where, seeds=seeds, device=self.device)
+        """Return the options of the comparison."""
+        place = {field.name: getattr(self, field.name) for field in fields(ClusterOptions)}
+        return CompareOptions(**place, seeds=seeds, device=self.device)
 
     def chosen(self, bench: Bench) -> tuple[str, ...]:
-        """The requested scenes, in the order of the bench.
+        """Return the requested scenes in the order of the bench.
 
         Raises:
-            PolarguideError: a scene of the other half, or none of the bench.
+            PolarguideError: a scene of the other half, or an unknown scene.
         """
-        half = bench.scenes(self.half)
+        half = bench.held_back if self.held_back else bench.development
         for name in self.scenes:
-            if name in bench.held_back and not self.held_back:
-                raise PolarguideError(
-                    "scenes",
-                    expected=f"a development scene ({', '.join(half)})",
-                    found=f"{name}, a held-back scene",
-                    remedy="Do not tune on held-back scenes. For the last run of a finished change, add --held-back.",
-                )
+            require(
+                self.held_back or name not in bench.held_back,
+                "scenes",
+                expected=f"a development scene ({', '.join(half)})",
+                found=f"{name}, a held-back scene",
+                remedy="Do not tune on held-back scenes. For the last run of a finished change, add --held-back.",
+            )
             check_choice("scenes", name, half)
         return tuple(name for name in half if name in self.scenes or not self.scenes)

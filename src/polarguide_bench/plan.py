@@ -1,7 +1,7 @@
-"""Which runs a comparison consists of, where each lives, what is still to be done for it, and how many run at a time.
+"""Plan of a comparison: its runs, their folders and states, and the number of simultaneous runs.
 
-A run's folder carries a digest of everything that its result depends on: the same command finds finished runs again,
-and whatever changes gets a folder of its own.
+The name of a run folder contains a digest of all inputs of the result. The same command therefore finds finished runs,
+and changed inputs lead to a new folder.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from polarguide import __version__
 from polarguide.capture import View
 from polarguide.capture.layout import SHARE
 from polarguide.capture.variants import black_pixels, mask_background
-from polarguide.core.errors import PolarguideError
+from polarguide.core.errors import PolarguideError, require
 from polarguide.core.options import DeviceName, Exposures, SceneOptions, index_of
 from polarguide.core.progress import SILENT, Reporter
 from polarguide.core.system import free_memory
@@ -35,8 +35,7 @@ from polarguide.runs.memory_plan import pixels_of, plan_memory
 from polarguide.runs.opened import OpenedRun, read_scene
 from polarguide.training.recipe import Recipe
 from polarguide.training.settings import STEPS, TrainSettings
-from polarguide_bench.gnerp.memory import plan_field_memory
-from polarguide_bench.gnerp.runs import FieldRun, open_field
+from polarguide_bench.gnerp.runs import FieldRun, open_field, plan_field_memory
 from polarguide_bench.options import ClusterOptions, CompareOptions
 from polarguide_bench.recipes import AnyRecipe, ablations_of, recipe_named
 
@@ -46,10 +45,13 @@ RUNS = "runs"
 
 @dataclass(frozen=True)
 class TableRow:
-    """A row of the tables: a recipe, and the pictures that it trains on.
+    """A row of the tables: a recipe and the pictures of its training.
 
     Attributes:
-        name: as the tables and the run folders call it. steps: where that is not the others' number.
+        name: name in tables and of run folders.
+        recipe: the recipe.
+        exposures: pictures of the training.
+        steps: own number of steps, if any.
     """
 
     name: str
@@ -59,7 +61,7 @@ class TableRow:
 
     @property
     def about(self) -> str:
-        """In one line."""
+        """Description in one line."""
         named = self.name == self.recipe.name
         about = self.recipe.about if named else f"{self.recipe.name}, {self.exposures}"
         return about if self.steps is None else f"{about.removesuffix('.')}; {self.steps:,} steps."
@@ -70,13 +72,14 @@ class Comparison:
     """A requested comparison.
 
     Attributes:
-        scenes: folders. recipes: the methods, in the order of the tables.
-        settings: settings of each training, as specified; the first seed, from which others count up.
-        options: how runs are trained, timed and shown.
-        out: folder to write.
-        seeds_of: by the name of a recipe, how many seeds where that is not ``options.seeds``.
-        steps_of: by the name of a recipe, how many steps where that is not ``settings.steps``.
-        command_line: for the record, if not ``polarguide compare``.
+        scenes: scene folders.
+        recipes: recipes in the order of the tables.
+        settings: settings of each training, with the first seed.
+        options: options for training, timing and presentation.
+        out: output folder.
+        seeds_of: number of seeds by recipe, if it differs from ``options.seeds``.
+        steps_of: number of steps by recipe, if it differs from ``settings.steps``.
+        command_line: command line for the record, if it is not ``polarguide compare``.
     """
 
     scenes: tuple[Path, ...]
@@ -90,36 +93,32 @@ class Comparison:
 
     @property
     def steps(self) -> int:
-        """Of every run whose recipe has no number of its own. They do not follow from the size: scenes are compared."""
+        """Steps of each run whose recipe has no own number."""
         return compared_steps(self.settings.steps)
 
     @property
     def rows(self) -> tuple[TableRow, ...]:
-        """The rows of the tables, in their order."""
+        """Rows of the tables in their order."""
         rows = []
         for recipe in self.recipes:
             steps = self.steps_of.get(recipe.name)
             if not self.options.exposures:
                 rows.append(TableRow(recipe.name, recipe, self.settings.exposures, steps))
-            for word in self.options.exposures:
-                name = word if len(self.recipes) == 1 else f"{recipe.name} {word}"
-                # Without any polarization in the pictures, the recipe without its terms, if there is one.
-                controls = {r.name: r for r in ablations_of(recipe.name) if word == "none"}
-                rows.append(TableRow(name, controls.get(f"{recipe.name}:unpolarized", recipe), word, steps))
+            for exposures in self.options.exposures:
+                name = exposures if len(self.recipes) == 1 else f"{recipe.name} {exposures}"
+                # Pictures without polarization are for the recipe without its polarization terms, if it exists.
+                controls = {r.name: r for r in ablations_of(recipe.name) if exposures == "none"}
+                control = controls.get(f"{recipe.name}:unpolarized", recipe)
+                rows.append(TableRow(name, control, exposures, steps))
         return tuple(rows)
 
-    def seeds(self, recipe: AnyRecipe) -> range:
-        """The seeds of a recipe."""
-        first = self.settings.seed
-        return range(first, first + self.seeds_of.get(recipe.name, self.options.seeds))
-
     def index_of(self, scene: SceneEntry) -> float:
-        """The refractive index of a scene's runs: the specified one, or the scene's own."""
+        """Return the refractive index of a scene's runs: the index of the settings, or that of the scene."""
         return index_of(self.settings.refractive_index, scene.refractive_index)
 
     @property
     def command(self) -> str:
-        """A command line that asks for the same."""
+        """Command line that requests the same comparison."""
         settings = self.settings
         options = self.options
         arguments: dict[str, Sequence[object]] = {
@@ -143,10 +142,17 @@ class Comparison:
 
 @dataclass(frozen=True)
 class SceneEntry:
-    """A scene as far as the record needs it.
+    """Facts about a scene for the record.
 
     Attributes:
-        warnings: what its scores do not mean because something of the ground truth is missing, a sentence each.
+        path: scene folder.
+        name: its name.
+        digest: SHA-256 of its files.
+        views: number of views.
+        test_views: names of the test views.
+        black_share: share of black pixels in the first test view.
+        warnings: limits of the scores because of missing ground truth, a sentence each.
+        refractive_index: index in ``scene.json``, if any.
     """
 
     path: Path
@@ -161,10 +167,15 @@ class SceneEntry:
 
 @dataclass(frozen=True)
 class PlannedRun:
-    """One training: a scene, a row of the tables with its recipe, and a seed.
+    """A training: a scene, a row of the tables with its recipe, and a seed.
 
     Attributes:
-        steps: steps of the training. settings: what it is asked for; what they leave open, ``train`` resolves.
+        scene: the scene.
+        row: row of the tables.
+        steps: steps of the training.
+        settings: requested settings. ``train`` resolves the open ones.
+        reading: options for reading the scene.
+        folder: run folder.
     """
 
     scene: SceneEntry
@@ -176,78 +187,81 @@ class PlannedRun:
 
     @property
     def label(self) -> str:
-        """Its name in messages."""
+        """Name in messages."""
         return f"{self.scene.name}, {self.row.name}, seed {self.settings.seed}"
 
-    @property
-    def recipe(self) -> AnyRecipe:
-        """The method."""
-        return self.row.recipe
-
     def state(self) -> State:
-        """How far it is, by what its folder holds."""
+        """Return the state of the run according to its folder."""
         if not (self.folder / CONFIGURATION).exists():
             return "new"
         try:
-            configuration = RunConfiguration.load(self.folder)
+            run = RunConfiguration.load(self.folder)
         except PolarguideError:
-            return "begun"  # going on with it will say what does not match
-        same = (
-            configuration.scene_digest == self.scene.digest
-            and configuration.recipe_data == self.recipe.data()
-            and configuration.settings.fit(self.settings)
-            and (
-                configuration.recipe,
-                configuration.downscale,
-                configuration.transfer,
-                configuration.test_views,
-            )
-            == (self.recipe.name, self.reading.downscale, self.reading.transfer, self.scene.test_views)
+            return "begun"  # the resumed training reports the mismatch
+        recipe = self.row.recipe
+        recorded = (
+            run.scene_digest,
+            run.recipe,
+            run.recipe_data,
+            run.downscale,
+            run.transfer,
+            run.test_views,
         )
-        if not same:
+        requested = (
+            self.scene.digest,
+            recipe.name,
+            recipe.data(),
+            self.reading.downscale,
+            self.reading.transfer,
+            self.scene.test_views,
+        )
+        if recorded != requested or not run.settings.fit(self.settings):
             return "begun"
         if self.metrics() is not None:
             return "done"
-        # Scoring looks for the scene where the training found it: going on with the training takes up a moved one.
-        moved = configuration.scene != str(self.scene.path.resolve())
-        leaves = PLY if isinstance(self.recipe, Recipe) else CHECKPOINT
-        finished = (self.folder / leaves).exists() and trained_steps(self.folder) == self.steps
+        # Scoring reads the scene from the path of the training. A resumed training updates the path of a moved scene.
+        moved = run.scene != str(self.scene.path.resolve())
+        result = PLY if isinstance(recipe, Recipe) else CHECKPOINT
+        finished = (self.folder / result).exists() and trained_steps(self.folder) == self.steps
         return "trained" if finished and not moved else "begun"
 
     def metrics(self) -> dict[str, Any] | None:
-        """The record of its scores, or None where there is no valid one by this version."""
+        """Read the record of the scores; None without a valid record of this version."""
         try:
             record = read_metrics(self.folder)
         except (OSError, PolarguideError):
             return None
-        whole = record["steps"] == self.steps
-        return record if whole and record["provenance"].get("sources") == code_digest() else None
+        current = record["provenance"].get("sources") == code_digest()
+        return record if record["steps"] == self.steps and current else None
 
 
 def scene_entries(comparison: Comparison, reporter: Reporter = SILENT) -> list[SceneEntry]:
-    """Read every scene once: its digest and its test views; warns where scores are not comparable.
+    """Read each scene once. Warn about scores that are not comparable.
 
     Raises:
-        PolarguideError: a scene that cannot be read, has no test views, or is called like another.
+        PolarguideError: a scene is invalid, has no test views, or has the same name as another.
     """
     entries: list[SceneEntry] = []
     for path in comparison.scenes:
         scene = read_scene(path, comparison.options, reporter)
         if comparison.settings.background == "masked":
             scene = mask_background(scene)
-        if scene.name in [entry.name for entry in entries]:
-            raise PolarguideError(
-                path,
-                expected="scenes with names of their own",
-                found=f"{scene.name} twice",
-                remedy="Rename a folder.",
-            )
-        if not scene.test_names:
-            raise PolarguideError(
-                path, expected="test views", found="none", remedy="Name some in split.json to score on."
-            )
+        require(
+            scene.name not in [entry.name for entry in entries],
+            path,
+            expected="scenes with different names",
+            found=f"{scene.name} twice",
+            remedy="Rename a folder.",
+        )
+        require(
+            scene.test_names,
+            path,
+            expected="test views",
+            found="none",
+            remedy="Name some in split.json to score on.",
+        )
         if comparison.settings.refractive_index is None and scene.refractive_index is not None:
-            reporter.say(f"{scene.name}: refractive index {scene.refractive_index:g}, as scene.json says")
+            reporter.say(f"{scene.name}: refractive index {scene.refractive_index:g} of scene.json")
         warnings = SceneFacts.of(scene).warnings
         for warning in warnings:
             reporter.warn(f"{scene.name}: {warning}")
@@ -267,19 +281,23 @@ def scene_entries(comparison: Comparison, reporter: Reporter = SILENT) -> list[S
 
 
 def black_share(view: View) -> float:
-    """The share of a view's pixels that are black."""
+    """Return the share of a view's pixels that are black."""
     return float(black_pixels(view).float().mean())
 
 
 def plan_runs(comparison: Comparison, scenes: Sequence[SceneEntry]) -> list[PlannedRun]:
-    """All runs, scene by scene; within a scene seed by seed, so that first results compare all recipes."""
-    every = {row.name: comparison.seeds(row.recipe) for row in comparison.rows}
-    return [
-        _planned(comparison, scene, row, seed)
-        for scene in scenes
-        for seed in sorted(set().union(*every.values()))
+    """Return all runs, scene by scene, then seed by seed, so that the first results compare all recipes."""
+    first = comparison.settings.seed
+    counts = {
+        row.name: comparison.seeds_of.get(row.recipe.name, comparison.options.seeds)
         for row in comparison.rows
-        if seed in every[row.name]
+    }
+    return [
+        _planned(comparison, scene, row, first + number)
+        for scene in scenes
+        for number in range(max(counts.values()))
+        for row in comparison.rows
+        if number < counts[row.name]
     ]
 
 
@@ -306,14 +324,14 @@ def _planned(comparison: Comparison, scene: SceneEntry, row: TableRow, seed: int
 def run_key(
     scene_digest: str, recipe: Mapping[str, Any], settings: TrainSettings, reading: SceneOptions, *, code: str
 ) -> str:
-    """A short digest of everything that a training's result depends on.
+    """Return a short digest of all inputs of a training.
 
     Args:
         scene_digest: SHA-256 of the scene's files.
         recipe: all values of the recipe.
         settings: settings of the training.
-        reading: how the pictures are read.
-        code: which version of the program trains.
+        reading: options for reading the pictures.
+        code: version of the training code.
 
     Returns:
         Ten hexadecimal digits.
@@ -324,26 +342,27 @@ def run_key(
 
 
 def most_memory(runs: Sequence[PlannedRun]) -> int:
-    """Bytes that the process of any of the trainings takes at most, as far as headers tell.
+    """Return an upper bound of the memory of each training in bytes, computed from file headers.
 
     Raises:
-        PolarguideError: a scene has gone, or its ``--memory`` is too small.
+        PolarguideError: a scene is missing, or its ``--memory`` is too small.
     """
-    pixels = {run.scene.path: run.reading.downscale for run in runs}
-    counts = {path: pixels_of(path, downscale) for path, downscale in pixels.items()}
-    kinds = {(run.scene.path, run.row.name): run for run in runs}.values()  # seeds take the same
-    return max((_expected_memory(run, counts[run.scene.path]) for run in kinds), default=0)
+    scales = {run.scene.path: run.reading.downscale for run in runs}
+    pixels = {path: pixels_of(path, downscale) for path, downscale in scales.items()}
+    kinds = {(run.scene.path, run.row.name): run for run in runs}.values()  # seeds need the same memory
+    return max((_expected_memory(run, pixels[run.scene.path]) for run in kinds), default=0)
 
 
 def _expected_memory(run: PlannedRun, pixels: Sequence[int]) -> int:
-    if isinstance(run.recipe, Recipe):
-        gaussians = most_gaussians(sum(pixels), run.recipe, run.settings, None)
-        return plan_memory(pixels, run.recipe, gaussians, limit=run.reading.memory).peak
-    return plan_field_memory(pixels, run.recipe, limit=run.reading.memory).peak
+    recipe = run.row.recipe
+    if isinstance(recipe, Recipe):
+        gaussians = most_gaussians(sum(pixels), recipe, run.settings, None)
+        return plan_memory(pixels, recipe, gaussians, limit=run.reading.memory).peak
+    return plan_field_memory(pixels, recipe, limit=run.reading.memory).peak
 
 
 def own_gpus(backend: Backend) -> tuple[str, ...]:
-    """The GPUs of this machine, as CUDA_VISIBLE_DEVICES calls them; none where the CPU computes."""
+    """Return the names of this machine's GPUs for CUDA_VISIBLE_DEVICES; none if the CPU computes."""
     if backend.device.type != "cuda":
         return ()
     visible = [name for name in os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",") if name.strip()]
@@ -351,12 +370,13 @@ def own_gpus(backend: Backend) -> tuple[str, ...]:
 
 
 def jobs_at_a_time(options: ClusterOptions, count: int, memory: int, gpus: Sequence[str]) -> int:
-    """How many jobs work at a time: at least one, and no more than there are.
+    """Return the number of simultaneous jobs: from one to the number of jobs.
 
     Args:
-        options: where, and how many if that was specified.
-        count: how many there are to do.
-        memory: bytes that each takes at most. gpus: GPUs of this machine, each for one job.
+        options: place of the computation, and the requested number, if any.
+        count: number of jobs.
+        memory: upper bound of the memory of each job in bytes.
+        gpus: GPUs of this machine, one for each job.
     """
     if options.jobs or not options.local:
         return max(1, min(options.jobs or count, count))
@@ -367,7 +387,7 @@ def jobs_at_a_time(options: ClusterOptions, count: int, memory: int, gpus: Seque
 
 
 def trained_steps(run: Path) -> int | None:
-    """Number of training steps completed at a run's checkpoint.
+    """Return the number of training steps at a run's checkpoint.
 
     None if the run has no checkpoint, or if the checkpoint does not record the number.
     """
@@ -380,15 +400,15 @@ def trained_steps(run: Path) -> int | None:
 
 
 def compared_steps(*specified: int | None) -> int:
-    """Steps of a run of a comparison: the first number that was specified, else ``STEPS``.
+    """Return the steps of a run of a comparison: the first specified number, else ``STEPS``.
 
-    They do not follow from the size of the pictures: scenes are compared.
+    They do not depend on the size of the pictures, so that scenes are comparable.
     """
     return next((steps for steps in specified if steps is not None), STEPS)
 
 
 def model_digest(kind: type) -> str:
-    """Digest of the file that defines a plug-in's shading model; empty for models of this package."""
+    """Return the digest of the file of a plug-in's shading model; empty for models of this package."""
     file = Path(inspect.getfile(kind))
     return "" if PACKAGE in file.parents else _digest(file.parent, [file])
 
@@ -397,7 +417,7 @@ def open_compared(folder: str | Path, device: DeviceName = "auto") -> OpenedRun 
     """Open a run of a comparison.
 
     Raises:
-        PolarguideError: the folder is no run, is damaged, or belongs to another version.
+        PolarguideError: the folder is not a run, is damaged, or belongs to another version.
     """
     recipe = recipe_named(RunConfiguration.load(Path(folder)).recipe)
     if isinstance(recipe, Recipe):

@@ -1,6 +1,6 @@
-"""The report of a comparison: one HTML file with tables, curves and pictures that needs nothing beside itself.
+"""Report of a comparison: one self-contained HTML file with tables, curves and pictures.
 
-Its charts are SVG: training curves, scores over a number under study, and over the pictures taken.
+Its charts are SVG: training curves, and scores over a studied parameter or over the number of pictures.
 """
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import math
 import shlex
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import NamedTuple
@@ -25,46 +25,57 @@ from polarguide.core.errors import PolarguideError
 from polarguide.core.files import write_text
 from polarguide.core.progress import Reporter
 from polarguide.results.evaluation.metrics import normal_angles_deg
-from polarguide.results.evaluation.table import COLUMNS, Metric
 from polarguide.runs.folder import RunLog
 from polarguide.runs.health import Health
 from polarguide.runs.opened import OpenedRun, read_scene
 from polarguide.visualization import figures
-from polarguide.visualization.layers import Picture, ground_truth_pictures, layer_picture
+from polarguide.visualization.figures import Picture, ground_truth_pictures, layer_picture
 from polarguide.visualization.pages import BASE, LAYERS, data_uri, page, page_part, templates
 from polarguide_bench.gnerp.runs import FieldRun
 from polarguide_bench.plan import Comparison, PlannedRun, SceneEntry, open_compared
 from polarguide_bench.results import Results
-from polarguide_bench.tables import formatted, sections, seed_counts
+from polarguide_bench.tables import BY_KEY, formatted, sections, seed_counts
 
 Numbers = NDArray[np.float64]
 POINTS = 240
+"""Largest number of points of a curve."""
 SMOOTHED_SHARE = 0.05
-"""Share of a training over which a curve is averaged: single steps show single views, which differ by decibels."""
+"""Share of a training in the running mean of a curve. Single steps show single views, which differ by decibels."""
 DASHES = ("none", "7 4", "2 3")
-"""There are eight colors: further curves repeat them dashed, then dotted."""
+"""Dashes of curves. Eight colors repeat with the next dashes."""
 STUDIED = ("psnr", "normal_mae_deg")
+"""Metrics over a studied parameter."""
 NAMES = {
     "views": "training views",
     "noise": "noise (1: exposed to full scale, 2: a quarter of that light)",
     "index": "refractive index",
     "spacing": "degrees between neighboring views",
 }
-"""What the parameters of a sweep are called at the axis, where their name does not say it."""
+"""Labels of the axis by studied parameter, if its name is not enough."""
 OVER_PICTURES = ("psnr_foreground", "normal_mae_deg", "specular_psnr", "diffuse_psnr")
+"""Metrics over the number of pictures."""
 APART = 0.12
-"""Between the points of two scenes in one column, of its width."""
+"""Distance between the points of two scenes in a column, as a share of its width."""
 
 
 class Series(NamedTuple):
-    """Points of one color: x, y, and the text under the pointer, empty for points that are not drawn."""
+    """Points of one color: x, y, and the text under the pointer. Points without text are not drawn."""
 
     name: str
     points: list[tuple[float, float, str]]
 
 
 class Panel(NamedTuple):
-    """One pair of axes: the places with words at the x axis and its ends, numbers at the y axis."""
+    """A pair of axes.
+
+    Attributes:
+        title: title above the axes.
+        axis: label of the x axis.
+        series: the points.
+        x_ticks: places and lines of text at the x axis.
+        x_ends: ends of the x axis.
+        y_ticks: numbers at the y axis.
+    """
 
     title: str
     axis: str
@@ -75,16 +86,18 @@ class Panel(NamedTuple):
 
 
 def panel(title: str, axis: str, series: list[Series], columns: Sequence[list[str]] = ()) -> Panel:
-    """A panel that holds all its points.
+    """Return a panel that contains all points.
 
     Args:
-        columns: words at the places 0, 1, ... of the x axis; without any, it has round numbers.
+        title: title above the axes.
+        axis: label of the x axis.
+        series: the points.
+        columns: lines of text at the places 0, 1, ... of the x axis. If empty, the axis has round numbers.
     """
-    points = [point for of in series for point in of.points]
-    x, y, _ = zip(*points, strict=True)
+    x, y, _ = zip(*(point for of in series for point in of.points), strict=True)
     y_ticks = ticks(min(y), max(y))
     if columns:
-        x_ticks = [(float(place), words) for place, words in enumerate(columns)]
+        x_ticks = [(float(place), lines) for place, lines in enumerate(columns)]
         return Panel(title, axis, series, x_ticks, (-0.5, len(columns) - 0.5), y_ticks)
     numbers = ticks(min(x) if min(x) > max(x) / 2 else 0.0, max(x))
     x_ticks = [(number, [f"{number:,g}"]) for number in numbers]
@@ -92,7 +105,7 @@ def panel(title: str, axis: str, series: list[Series], columns: Sequence[list[st
 
 
 def ticks(low: float, high: float) -> list[float]:
-    """Round numbers at equal distances that enclose [low, high], about six."""
+    """Return about six round numbers at equal distances that enclose [low, high]."""
     rough = max(high - low, 1e-6) / 6
     power = 10.0 ** math.floor(math.log10(rough))
     step = next(power * factor for factor in (1, 2, 5, 10) if power * factor >= rough * 0.999)
@@ -109,7 +122,7 @@ def chart(
     label: str = "scores",
     size: tuple[int, int] = (430, 330),
 ) -> str:
-    """An SVG file, its colors in the order of the legend; ``size``: width and height of a panel."""
+    """Return an SVG file. Colors follow the order of the legend; ``size`` is the width and height of a panel."""
     template = templates(BASE).get_template("chart.svg")
     return template.render(
         dashes=DASHES, panels=panels, legend=legend, lines=lines, label=label, width=size[0], height=size[1]
@@ -117,7 +130,7 @@ def chart(
 
 
 class Curve(NamedTuple):
-    """PSNR in dB [P] over step and seconds [P] of one run, smoothed."""
+    """Smoothed PSNR in dB [P] of a run over steps [P] and seconds [P]."""
 
     name: str
     steps: Numbers
@@ -126,18 +139,18 @@ class Curve(NamedTuple):
 
 
 def read_curve(run: Path, name: str) -> Curve | None:
-    """The curve of a run by its log, at most ``POINTS`` points; None where there is no line to draw."""
+    """Read the curve of a run from its log, with at most ``POINTS`` points; None for fewer than two points."""
     measured = [(row["step"], row.get("seconds"), row.get("psnr")) for row in RunLog(run).rows()]
     rows = [row for row in measured if None not in row]
     if len(rows) < 2:
         return None
     steps, seconds, psnr = np.array(rows, np.float64).T
-    keep = np.unique(np.linspace(0, len(rows) - 1, POINTS).round().astype(int))
-    return Curve(name, steps[keep] + 1, seconds[keep], smoothed(psnr, SMOOTHED_SHARE)[keep])
+    index = np.unique(np.linspace(0, len(rows) - 1, POINTS).round().astype(int))
+    return Curve(name, steps[index] + 1, seconds[index], smoothed(psnr, SMOOTHED_SHARE)[index])
 
 
 def smoothed(values: Numbers, share: float) -> Numbers:
-    """Centered running mean over a share of all values; the window shrinks at both ends, so that it stays centered."""
+    """Return the centered running mean over a share of all values. The window shrinks at both ends to stay centered."""
     half = int(len(values) * share / 2)
     index = np.arange(len(values))
     reach = np.minimum(half, np.minimum(index, len(values) - 1 - index))
@@ -146,7 +159,7 @@ def smoothed(values: Numbers, share: float) -> Numbers:
 
 
 def curves_svg(curves: Sequence[Curve], axis: str) -> str:
-    """An SVG element with PSNR over ``axis``, "steps" or "seconds", in the colors of the page that it is put into."""
+    """Return an SVG element with PSNR over ``axis``, "steps" or "seconds", in the colors of the surrounding page."""
     series = [
         Series(c.name, [(x, y, "") for x, y in zip(getattr(c, axis), c.psnr, strict=True)]) for c in curves
     ]
@@ -155,7 +168,7 @@ def curves_svg(curves: Sequence[Curve], axis: str) -> str:
 
 
 def read_study(scene: Path) -> tuple[str, float] | None:
-    """The number under study that ``scene.json`` names, as (parameter, value), or None."""
+    """Read the studied parameter and its value from ``scene.json``; None without one."""
     try:
         study = json.loads((scene / "scene.json").read_text(encoding="utf-8"))["study"]
         return str(study["parameter"]), float(study["value"])
@@ -164,13 +177,14 @@ def read_study(scene: Path) -> tuple[str, float] | None:
 
 
 def study_svg(results: Results, studies: Mapping[str, tuple[str, float] | None]) -> str | None:
-    """Every recipe's scores over the number under study.
+    """Return a chart of the scores of each recipe over the studied parameter.
 
     Args:
-        studies: by scene, what ``read_study`` found.
+        results: the comparison.
+        studies: result of ``read_study`` by scene.
 
     Returns:
-        None where the scenes are no family of ``polarguide synth --sweep``: fewer than two values, or different
+        None if the scenes are not a family of ``polarguide synth --sweep``: fewer than two values, or different
         parameters.
     """
     values = {scene: study[1] for scene, study in studies.items() if study is not None}
@@ -178,61 +192,76 @@ def study_svg(results: Results, studies: Mapping[str, tuple[str, float] | None])
     if len(values) < len(studies) or len(parameters) != 1 or len(set(values.values())) < 2:
         return None
     name = str(parameters.pop())
-    panels = []
-    for metric in _metrics(STUDIED):
-        series = [Series(recipe, []) for recipe in results.recipes]
-        for scene, recipe, mean in _scores(results, metric):
-            text = f"{recipe}, {name} {values[scene]:g}: {mean:.2f}"
-            series[results.recipes.index(recipe)].points.append((values[scene], mean, text))
-        if any(of.points for of in series):
-            series = [Series(of.name, sorted(of.points)) for of in series]
-            panels.append(panel(metric.heading, NAMES.get(name, name), series))
+
+    def point(scene: str, recipe: str) -> tuple[str, float, str]:
+        return recipe, values[scene], f"{recipe}, {name} {values[scene]:g}"
+
+    panels = _score_panels(results, STUDIED, NAMES.get(name, name), results.recipes, point)
     return chart(panels, results.recipes) if panels else None
 
 
 def exposure_svg(results: Results, pictures: Mapping[tuple[str, str], int]) -> str | None:
-    """The scores of all rows of the tables, a panel for each metric, a column for each row, a color for each scene.
+    """Return a chart of all scores: a panel for each metric, a column for each row of the tables, a color by scene.
 
-    Rows come in the order of the pictures they took, and of the tables where these are as many.
+    Columns are sorted by the number of pictures, then as in the tables.
 
     Args:
-        pictures: by scene and row, how many were taken.
+        results: the comparison.
+        pictures: number of pictures by scene and row.
 
     Returns:
-        None where there is nothing to draw.
+        None without scores.
     """
     numbers = {row: [pictures[scene, row] for scene in results.scenes] for row in results.recipes}
     rows = sorted(numbers, key=lambda row: max(numbers[row]))
     columns = [[row, " to ".join(map(str, sorted({min(numbers[row]), max(numbers[row])})))] for row in rows]
-    panels = []
-    for metric in _metrics(OVER_PICTURES):
-        series = [Series(scene, []) for scene in results.scenes]
-        for scene, row, mean in _scores(results, metric):
-            place = results.scenes.index(scene)
-            x = rows.index(row) + (place - (len(series) - 1) / 2) * min(APART, 1 / (len(series) + 1))
-            text = f"{scene}, {row}, {pictures[scene, row]} pictures: {mean:.2f}"
-            series[place].points.append((x, mean, text))
-        if any(of.points for of in series):
-            panels.append(panel(metric.heading, "training pictures", series, columns))
+    count = len(results.scenes)
+
+    def point(scene: str, row: str) -> tuple[str, float, str]:
+        offset = (results.scenes.index(scene) - (count - 1) / 2) * min(APART, 1 / (count + 1))
+        return scene, rows.index(row) + offset, f"{scene}, {row}, {pictures[scene, row]} pictures"
+
+    panels = _score_panels(results, OVER_PICTURES, "training pictures", results.scenes, point, columns)
     return chart(panels, results.scenes, lines=False) if panels else None
 
 
-def _metrics(keys: Sequence[str]) -> list[Metric]:
-    return [metric for key in keys for metric in COLUMNS if metric.key == key]
+def _score_panels(
+    results: Results,
+    keys: Sequence[str],
+    axis: str,
+    names: Sequence[str],
+    point: Callable[[str, str], tuple[str, float, str]],
+    columns: Sequence[list[str]] = (),
+) -> list[Panel]:
+    """Return a panel for each metric with scores.
 
-
-def _scores(results: Results, metric: Metric) -> list[tuple[str, str, float]]:
-    """Scene, recipe and mean, where there is one."""
-    table = results.scores.dropna(subset=["scene", metric.key])
-    return list(zip(table["scene"], table["recipe"], table[metric.key], strict=True))
+    Args:
+        results: the comparison.
+        keys: keys of the metrics.
+        axis: label of the x axis.
+        names: names of the series.
+        point: returns the series, x and text of a scene and a recipe.
+        columns: see ``panel``.
+    """
+    panels = []
+    for metric in (BY_KEY[key] for key in keys):
+        table = results.scores.dropna(subset=["scene", metric.key])
+        points: dict[str, list[tuple[float, float, str]]] = {name: [] for name in names}
+        for scene, recipe, mean in zip(table["scene"], table["recipe"], table[metric.key], strict=True):
+            name, x, text = point(scene, recipe)
+            points[name].append((x, mean, f"{text}: {mean:.2f}"))
+        if any(points.values()):
+            series = [Series(name, sorted(of)) for name, of in points.items()]
+            panels.append(panel(metric.heading, axis, series, columns))
+    return panels
 
 
 SIDES = (1600, 1200, 800, 600, 400, 300, 200)
-"""Longest sides in pixels to try until a view fits its share of the file."""
+"""Candidates for the longest side of a view in pixels, to fit its share of the file."""
 
 
 class Tile(NamedTuple):
-    """One method (or the ground truth) on one view: its layers, and its scores there as a line of text a layer."""
+    """Pictures of a view by a method or of the ground truth: a picture and a line of scores for each layer."""
 
     name: str
     pictures: Mapping[str, Picture]
@@ -240,11 +269,14 @@ class Tile(NamedTuple):
 
 
 class EmbeddedView(NamedTuple):
-    """One view of a scene with all its tiles as data URIs.
+    """A view of a scene with its tiles as data URIs.
 
     Attributes:
-        scene, view: names. width, height: those of the captured pictures, for the shape of the tiles.
-        tiles: for each its name, its layers as data URIs, and its lines of scores.
+        scene: name of the scene.
+        view: name of the view.
+        width: width of the captured picture, for the shape of the tiles.
+        height: height of the captured picture.
+        tiles: name, layers as data URIs, and lines of scores of each tile.
     """
 
     scene: str
@@ -255,15 +287,16 @@ class EmbeddedView(NamedTuple):
 
 
 def embed(scene: str, view: str, tiles: Sequence[Tile], limit: int) -> tuple[EmbeddedView | None, str | None]:
-    """Encode one view, smaller if it has to be.
+    """Encode a view, with reduced pictures if necessary.
 
     Args:
-        scene, view: names.
-        tiles: at least one, of pictures of one size.
-        limit: bytes that the data URIs may take.
+        scene: name of the scene.
+        view: name of the view.
+        tiles: at least one, with pictures of the same size.
+        limit: largest size of the data URIs in bytes.
 
     Returns:
-        The view, or None if it does not fit; and a sentence on what was reduced or left out, or None.
+        The view, or None if it does not fit; and a sentence about a reduction or an omission, or None.
     """
     height, width = next(iter(tiles[0].pictures.values())).shape[:2]
     longest = max(height, width)
@@ -279,17 +312,16 @@ def embed(scene: str, view: str, tiles: Sequence[Tile], limit: int) -> tuple[Emb
 
 
 def chosen_views(names: Sequence[str], count: int) -> list[str]:
-    """At most ``count`` of the names, evenly spread, the first among them."""
-    if count >= len(names):
-        return list(names)
+    """Return at most ``count`` names at equal distances, beginning with the first."""
+    count = min(count, len(names))
     return [names[index * len(names) // count] for index in range(count)]
 
 
 REPORT = "report.html"
 ERROR_SHEET = "errors.png"
-"""What scoring writes into a run's folder where it draws the errors."""
+"""File of the error maps in a run folder."""
 PICTURE_BYTES = 28_000_000
-"""What all pictures of a report may take, so that the file stays one that can be mailed and opened."""
+"""Largest size of all pictures of a report. Browsers and mail programs can still handle the file."""
 GROUND_TRUTH = "ground truth"
 PHOTOGRAPH = "photograph"
 LAYER_METRICS = {
@@ -300,17 +332,17 @@ LAYER_METRICS = {
     "error": "psnr",
     "normal_error": "normal_mae_deg",
 }
-"""Which score stands beside which layer."""
+"""Metric next to each layer."""
 ERROR_HIGH = 0.25
-"""Mean absolute difference of shown pictures that is brightest in the error map."""
+"""Mean absolute difference of displayed pictures at the bright end of the error map."""
 NORMAL_ERROR_HIGH = 45.0
-"""Degrees that are brightest in the map of normal errors."""
+"""Angle at the bright end of the map of normal errors, in degrees."""
 LEGEND = {
     "error": f"mean absolute difference over the channels, 0 to {ERROR_HIGH:g} of white",
     "normal_error": f"angle to the true normal, 0 to {NORMAL_ERROR_HIGH:g} degrees",
     "metalness": "share of metal, 0 to 1",
 }
-"""What the colors of false-color layers say."""
+"""Meaning of the colors of false-color layers."""
 
 
 def write_report(
@@ -320,14 +352,14 @@ def write_report(
     results: Results,
     reporter: Reporter,
 ) -> None:
-    """Render the pictures of the finished runs and write ``report.html`` in one step."""
+    """Render the pictures of the finished runs, and write ``report.html`` atomically."""
     views: list[EmbeddedView] = []
     remarks: list[str] = []
     curves: dict[str, list[Curve]] = {}
     sheets: dict[str, list[tuple[str, str]]] = {}
     finished = [run for run in plan if run.state() == "done"]
     for scene in scenes:
-        # By row, the run with the lowest seed, which comes first.
+        # The run with the lowest seed of each row. It comes first in the plan.
         first = {run.row.name: run for run in reversed(finished) if run.scene.name == scene.name}
         runs = [first[row.name] for row in comparison.rows if row.name in first]
         sheets[scene.name] = [
@@ -354,30 +386,29 @@ def write_report(
 
 
 def _health(runs: Sequence[PlannedRun]) -> list[str]:
-    """Health of the trainings: the evidence behind the layers (equal runs in one line), and a line for each warning."""
-    alike: dict[str, list[str]] = {}
+    """Return a line for each kind of evidence with its runs, and a line for each warning."""
+    labels: dict[str, list[str]] = {}
     warnings = []
     for run in runs:
         polarization, own = recorded_health(run.folder)
-        text = "not recorded, not checked" if polarization is None else polarization
-        alike.setdefault(f"polarization {text}", []).append(run.label)
+        labels.setdefault(polarization or "not recorded, not checked", []).append(run.label)
         warnings += [f"{run.label}: {warning}" for warning in own]
-    return [f"{text}: {'; '.join(labels)}" for text, labels in alike.items()] + warnings
+    return [f"polarization {text}: {'; '.join(names)}" for text, names in labels.items()] + warnings
 
 
 def _scene_views(
     comparison: Comparison, entry: SceneEntry, runs: Sequence[PlannedRun], names: Sequence[str], limit: int
 ) -> Iterator[tuple[EmbeddedView | None, str | None]]:
-    """The named views of one scene, as ``embed`` gives them; ``limit`` in bytes for each."""
+    """Yield the result of ``embed`` for views of a scene. The limit is in bytes for each view."""
     scene = read_scene(entry.path, comparison.options)
-    opened = [open_compared(run.folder, comparison.options.own_device) for run in runs]
+    device = comparison.options.device if comparison.options.local else "auto"
+    opened = [open_compared(run.folder, device) for run in runs]
     scores = [(run.metrics() or {})["views"] for run in runs]
     for name in names:
         view = scene.view(name)
-        tiles = [_ground_truth_tile(scene, view)]
         rows = zip(runs, opened, scores, strict=True)
-        tiles += [_tile(planned.row.name, run, view, s.get(name, {})) for planned, run, s in rows]
-        yield embed(entry.name, name, tiles, limit)
+        tiles = [_tile(planned.row.name, run, view, s.get(name, {})) for planned, run, s in rows]
+        yield embed(entry.name, name, [_ground_truth_tile(scene, view), *tiles], limit)
 
 
 def _ground_truth_tile(scene: Scene, view: View) -> Tile:
@@ -385,19 +416,19 @@ def _ground_truth_tile(scene: Scene, view: View) -> Tile:
     ids = None if view.ground_truth is None else view.ground_truth.object_ids
     metals = [item.id for item in scene.objects if item.material.kind in METAL_CLASSES]
     if ids is not None and metals:
-        truly = torch.isin(ids, torch.tensor(metals, dtype=ids.dtype))
-        pictures["metalness"] = figures.scalar_to_rgb(truly.float(), 0.0, 1.0, "inferno")
+        mask = torch.isin(ids, torch.tensor(metals, dtype=ids.dtype))
+        pictures["metalness"] = figures.scalar_to_rgb(mask.float(), 0.0, 1.0, "inferno")
     return Tile(GROUND_TRUTH if view.ground_truth is not None else PHOTOGRAPH, pictures, {})
 
 
 def _tile(name: str, run: OpenedRun | FieldRun, view: View, scores: Mapping[str, float | None]) -> Tile:
-    """The pictures of one view by a run called ``name``."""
+    """Return the pictures of a view by a run with their scores."""
     result = run.model.render(view.camera, surface=True).to("cpu")
-    pictures: dict[str, Picture] = {}
-    for layer in ("final", "diffuse", "specular", "normal"):
-        picture = layer_picture(result, layer, view.camera)
-        if picture is not None:
-            pictures[layer] = picture
+    pictures = {
+        layer: picture
+        for layer in ("final", "diffuse", "specular", "normal")
+        if (picture := layer_picture(result, layer, view.camera)) is not None
+    }
     metalness = result.layers.get("metalness")
     if metalness is not None and bool(metalness.any()):
         pictures["metalness"] = figures.scalar_to_rgb(metalness, 0.0, 1.0, "inferno")
@@ -408,9 +439,8 @@ def _tile(name: str, run: OpenedRun | FieldRun, view: View, scores: Mapping[str,
         if ground_truth.mask is not None:
             angles = torch.where(ground_truth.mask, angles, torch.nan)
         pictures["normal_error"] = figures.scalar_to_rgb(angles, 0.0, NORMAL_ERROR_HIGH, "inferno")
-    by_key = {metric.key: metric for metric in COLUMNS}
     lines = {
-        layer: f"{formatted(value, by_key[key])} {by_key[key].unit}"
+        layer: f"{formatted(value, BY_KEY[key])} {BY_KEY[key].unit}"
         for layer, key in LAYER_METRICS.items()
         if layer in pictures and (value := scores.get(key)) is not None
     }
@@ -425,21 +455,18 @@ def report_html(
     sheets: Mapping[str, Sequence[tuple[str, str]]] = MappingProxyType({}),
     health: Sequence[str] = (),
 ) -> str:
-    """The page.
+    """Return the page as HTML with escaped texts. It loads nothing from outside, but links to ``sheets``.
 
     Args:
         results: the comparison.
         views: the pictures.
-        curves: by scene, those of its recipes.
-        remarks: what was left out of the pictures or reduced, a sentence each.
-        sheets: by scene, recipes and their pictures of errors, as paths from the page.
-        health: what trainings say of themselves, a sentence each.
-
-    Returns:
-        HTML; all names and texts in it are escaped, and it asks for nothing from outside. It links to ``sheets``.
+        curves: curves of the recipes by scene.
+        remarks: sentences about omitted or reduced pictures.
+        sheets: recipes and paths of their error maps by scene, relative to the page.
+        health: sentences about the health of the trainings.
     """
     package = "polarguide_bench"
-    # Metalness can be chosen only where a run has found some.
+    # Metalness is a choice only if a run has found metal.
     metal = any("metalness" in pictures for view in views for _, pictures, _ in view.tiles[1:])
     return page(
         package,
@@ -469,47 +496,47 @@ def report_html(
 def _summary(results: Results) -> str:
     record = results.record
 
-    def plural(count: int, word: str) -> str:
-        return f"{count:,} {word}{'' if count == 1 else 's'}"
+    def plural(count: int, noun: str) -> str:
+        return f"{count:,} {noun}{'' if count == 1 else 's'}"
 
     seeds = " or ".join(plural(count, "seed") for count in seed_counts(results))
     own = (
-        " unless a row says otherwise" if any(recipe.steps is not UNSET for recipe in record.recipes) else ""
+        ", if a row has no other number"
+        if any(recipe.steps is not UNSET for recipe in record.recipes)
+        else ""
     )
     counts = f"{plural(len(record.recipes), 'recipe')}, {plural(len(record.scenes), 'scene')}, {seeds}"
-    return f"{counts}, {record.settings.steps:,} steps a run{own}"
+    return f"{counts}, {record.settings.steps:,} steps per run{own}"
 
 
 def _without_folders(command: str) -> str:
-    """A command with the names of files and folders alone: where they lie on a machine is nobody's business."""
+    """Return a command with the names of files but without their folders, which are private."""
     try:
-        words = shlex.split(command)
-    except ValueError:  # of a record that somebody has edited
+        return shlex.join(Path(word).name if "/" in word else word for word in shlex.split(command))
+    except ValueError:  # an edited record
         return command
-    return shlex.join(Path(word).name if "/" in word else word for word in words)
 
 
 def _facts(results: Results) -> dict[str, str]:
-    """The facts at the end of the report, by heading."""
+    """Return the facts at the end of the report by heading."""
     record = results.record
     facts = msgspec.to_builtins(record.provenance) | msgspec.to_builtins(record.settings)
     if facts["refractive_index"] is None:
-        facts["refractive_index"] = "that of each scene"
+        facts["refractive_index"] = "own index of each scene"
     facts["command"] = _without_folders(facts["command"])
     stated = {key.replace("_", " "): "unknown" if v is None else str(v) for key, v in facts.items()}
     for scene in record.scenes:
-        index = (
-            f"; refractive index {scene.refractive_index:g}" if scene.refractive_index is not UNSET else ""
-        )
+        index = scene.refractive_index
+        own = "" if index is UNSET else f"; refractive index {index:g}"
         views = f"{scene.views} views, test: {', '.join(scene.test_views)}"
-        stated[f"scene {scene.name}"] = f"{views}; digest {scene.digest[:16]}{index}"
+        stated[f"scene {scene.name}"] = f"{views}; digest {scene.digest[:16]}{own}"
     return stated
 
 
 def recorded_health(run: Path) -> tuple[str | None, tuple[str, ...]]:
-    """The polarization and the warnings in a run's ``health.json``; None and no warnings without the file.
+    """Read the polarization and the warnings from a run's ``health.json``; None and no warnings without the file.
 
-    A damaged file becomes a warning, so that other runs are still reported.
+    An invalid file becomes a warning, so that other runs are still reported.
     """
     try:
         health = Health.load(run)

@@ -1,6 +1,6 @@
-"""A child process of a comparison or a batch: does the task on standard input, as long as that is open.
+"""Child process of a comparison or a batch. It performs the task on its standard input, and stops when that closes.
 
-Of a batch it takes one capture through all its steps: prepare, inspect, train, eval, share and export.
+The task of a batch is one capture with all its steps: prepare, inspect, train, eval, share and export.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing import Any
 import msgspec
 
 from polarguide import __version__
-from polarguide.core.errors import PolarguideError
+from polarguide.core.errors import PolarguideError, require
 from polarguide.core.files import make_folder
 from polarguide.core.options import SessionOptions
 from polarguide.core.records import decode
@@ -37,10 +37,9 @@ from polarguide.runs.opened import OpenedRun
 from polarguide.runs.train import train_gaussians
 from polarguide.training.recipe import Recipe
 from polarguide.visualization import figures
-from polarguide.visualization.layers import layer_picture
+from polarguide.visualization.figures import layer_picture
 from polarguide.visualization.pages import data_uri
-from polarguide_bench.children import Message, Task, Training, files_digest
-from polarguide_bench.collection import (
+from polarguide_bench.children import (
     EXPORT,
     FORMAT,
     INSPECTION,
@@ -49,8 +48,12 @@ from polarguide_bench.collection import (
     SHARE,
     STEPS,
     CaptureRecord,
+    Message,
     Processing,
     Step,
+    Task,
+    Training,
+    files_digest,
     prepare_settings,
 )
 from polarguide_bench.gnerp.runs import FieldRun, train_field
@@ -62,11 +65,11 @@ THUMBNAIL = 320
 
 
 def process(task: Processing) -> None:
-    """Take the steps that are still to be taken.
+    """Take the remaining steps of a capture.
 
     Raises:
-        PolarguideError: a step cannot be taken, or the folder was begun with something else.
-        KeyboardInterrupt: stopped; a training has saved its state, other steps are begun again.
+        PolarguideError: a step failed, or the folder belongs to another request.
+        KeyboardInterrupt: the process was stopped. A training has saved its state; other steps start again.
     """
     folder = Path(task.folder)
     make_folder(folder)
@@ -83,14 +86,13 @@ def process(task: Processing) -> None:
 
 
 def _prepare(task: Processing, scene: Path, folder: Path) -> None:
-    if task.request.prepare is None:
-        return
-    prepared = prepare_scene(task.request.source, scene, prepare_settings(task.request.prepare))
-    if not prepared.posed:
-        raise PolarguideError(
+    if task.request.prepare is not None:
+        prepared = prepare_scene(task.request.source, scene, prepare_settings(task.request.prepare))
+        require(
+            prepared.posed,
             prepared.folder,
             expected="a scene with poses",
-            found="none",
+            found="a scene without poses",
             remedy="Give --poses sfm or --poses PATH among its options.",
         )
 
@@ -124,13 +126,17 @@ def _evaluate(task: Processing, scene: Path, folder: Path) -> dict[str, Any]:
     evaluate(run, speed=False)
     view = (run.scene.test_views or run.scene.train_views)[0]
     result = run.model.render(view.camera, surface=True).to("cpu")
-    pictures = {"photograph": figures.radiance_to_rgb(view.photograph())}
-    pictures |= {
-        layer: picture
-        for layer in ("final", "specular", "normal")
-        if (picture := layer_picture(result, layer, view.camera)) is not None
+    pictures = {
+        "photograph": figures.radiance_to_rgb(view.photograph()),
+        **{layer: layer_picture(result, layer, view.camera) for layer in ("final", "specular", "normal")},
     }
-    return {"pictures": tuple((label, data_uri(p, label, THUMBNAIL)) for label, p in pictures.items())}
+    return {
+        "pictures": tuple(
+            (label, data_uri(picture, label, THUMBNAIL))
+            for label, picture in pictures.items()
+            if picture is not None
+        )
+    }
 
 
 def _share(task: Processing, scene: Path, folder: Path) -> None:
@@ -152,30 +158,30 @@ _ACTIONS: dict[Step, Callable[[Processing, Path, Path], dict[str, Any] | None]] 
     "share": _share,
     "export": _export,
 }
-"""Function of each step of a capture; it returns fields of the capture's record."""
+"""Function of each step of a capture. It returns fields of the capture's record."""
 
 
 PATIENCE_SECONDS = 120.0
-"""How long to wait for a process that has lost its worker: it still saves the state that this one goes on from."""
+"""Timeout for a process that has lost its worker. This process resumes from the state that the other one saves."""
 
 
 def main() -> int:
-    """Do the task on standard input, and stop where that ends; returns the exit status that ``obey`` gives."""
-    # SIGTERM acts as Ctrl-C does, so that whatever is open is closed; a shell's background jobs ignore Ctrl-C.
+    """Perform the task on standard input, stop when that closes, and return the exit status of ``obey``."""
+    # SIGTERM acts like Ctrl-C, so that open files are closed. Background jobs of a shell ignore Ctrl-C by default.
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, signal.default_int_handler)
     keep_freed_memory()
-    # Unbuffered: a thread that waits for more would hold the buffer at the process's end.
+    # Unbuffered: a waiting thread would hold the lock of a buffer when the process ends.
     stdin = io.FileIO(0, closefd=False)
 
     def stop_at_end_of_input() -> None:
-        """Interrupt the main thread when the other end is closed: a worker asks to stop, or was killed."""
+        """Interrupt the main thread when the worker closes the input or is killed."""
         stdin.readall()
         _thread.interrupt_main()
 
     try:
         line = stdin.readline()
-        if line.endswith(b"\n"):  # nobody waits for the end of a line that is cut short
+        if line.endswith(b"\n"):  # the input of an incomplete line has already ended
             threading.Thread(target=stop_at_end_of_input, daemon=True).start()
         return obey(line)
     except KeyboardInterrupt:
@@ -183,38 +189,32 @@ def main() -> int:
 
 
 def obey(line: bytes) -> int:
-    """Do a task; returns the exit status (0 done, 130 stopped, 2 wrong input, with one line)."""
+    """Perform the task of a message, and return the exit status: 0 done, 130 stopped, 2 invalid input.
+
+    Invalid input prints one line. Different code would mix results, so it is invalid input. Comments may differ.
+    """
     try:
         message: Any = decode(line, Message, "task")
-        _check_code(message)
-        _do(message.task)
+        if message.files != files_digest() and message.code != code_digest():
+            raise PolarguideError(
+                "worker",
+                expected=f"the same code as the command that uses this worker (digest {message.code})",
+                found=f"polarguide {__version__} with digest {code_digest()} in {Path(__file__).parents[1]}",
+                remedy="Install identical code on all machines, and do not change it while the command runs.",
+            )
+        _perform(message.task)
     except PolarguideError as error:
         print(error, file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         return 130
-    except OSError as error:  # missing rights, a full disk, a file where a folder should be
+    except OSError as error:  # missing permissions, a full disk, a file instead of a folder
         print(f"{error.filename or 'files'}: {error.strerror or error}.", file=sys.stderr)
         return 2
     return 0
 
 
-def _check_code(message: Message) -> None:
-    """Refuse to compute with other code than that of the command: results would be mixed. Comments do not count.
-
-    Raises:
-        PolarguideError: this installation differs.
-    """
-    if message.files != files_digest() and message.code != code_digest():
-        raise PolarguideError(
-            "worker",
-            expected=f"the same code as the command that uses this worker (digest {message.code})",
-            found=f"polarguide {__version__} with digest {code_digest()} in {Path(__file__).parents[1]}",
-            remedy="Install identical code on all machines, and do not change it while the command runs.",
-        )
-
-
-def _do(task: Task) -> None:
+def _perform(task: Task) -> None:
     use_threads(task.compute.threads)
     if isinstance(task, Processing):
         _wait_for_others(Path(task.folder) / RUN)
@@ -228,7 +228,6 @@ def _do(task: Task) -> None:
 
 
 def _train_run(task: Training) -> None:
-    """Train a run, or go on with the one in its folder."""
     recipe = recipe_named(task.recipe)
     trains: Any = train_gaussians if isinstance(recipe, Recipe) else train_field
     with StopSignals() as should_stop:
@@ -245,7 +244,7 @@ def _train_run(task: Training) -> None:
 
 
 def _wait_for_others(run: Path) -> None:
-    """Wait until nobody writes to a run.
+    """Wait until no other process writes to a run.
 
     Raises:
         PolarguideError: another training does not end.

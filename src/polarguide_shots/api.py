@@ -20,11 +20,11 @@ from polarguide.runs.opened import OpenedRun, read_scene
 from polarguide_shots.calibration.calibrate import calibrate_sensor
 from polarguide_shots.measurement.line import measure_shots
 from polarguide_shots.options import ShotOptions
-from polarguide_shots.sets import known_places
+from polarguide_shots.sets import known_indices
 from polarguide_shots.write import FORMATS, WrittenShots, check_formats, write_shots, write_view_maps
 
 _OF_MAPS = ("full_well", "read_noise", "snr")
-"""Options of shots that maps of views of a scene depend on."""
+"""Names of the options of shots that also apply to maps of views of a scene."""
 
 calibrate = calibrate_sensor
 measure = measure_shots
@@ -43,31 +43,31 @@ def priors(
     shots: ShotOptions = ShotOptions(),
     reporter: Reporter = SILENT,
 ) -> Path:
-    """Polarization priors of views of a scene: pictures and a contact sheet, and maps if ``formats`` are given.
+    """Write polarization priors of views of a scene: pictures, a contact sheet, and maps in the requested formats.
 
-    All of it is of the scene's views as they are: with their masks, exposures and size. ``shot_priors`` is the same for
-    files of a camera.
+    The priors use the masks, exposures and size of the views. ``shot_priors`` does the same for files of a camera.
 
     Args:
-        scene: a scene with poses, or its folder, which is read as ``reading`` says.
+        scene: a scene with poses, or its folder.
         out: folder to write.
-        run, views, threshold: as ``results.rendering.priors.write_priors`` takes them.
-        refractive_index: refractive index of the surfaces; None: as ``scene.json`` says, else 1.5.
-        formats: of maps as ``shot_priors`` writes them, a folder for each view: png, exr, npy, page.
+        run, views, threshold: see ``results.rendering.priors.write_priors``.
+        refractive_index: refractive index of the surfaces; None: the value in ``scene.json``, else 1.5.
+        reading: options of reading a scene folder.
+        formats: formats of the maps of ``shot_priors`` (png, exr, npy, page), written to a folder for each view.
         shots: ``full_well``, ``read_noise`` and ``snr`` for the maps.
+        reporter: receiver of progress and messages.
 
     Returns:
-        The contact sheet.
+        The path of the contact sheet.
 
     Raises:
-        PolarguideError: the scene cannot be read, a view has no such pictures, or an option is wrong or means nothing
-            here.
+        PolarguideError: the scene cannot be read, a view lacks pictures, or an option is invalid or does not apply.
     """
     given = [name for name in changed(shots) if not (formats and name in _OF_MAPS)]
     if given:
         hint = " With --formats it applies to the maps." if given[0] in _OF_MAPS else ""
         raise PolarguideError(
-            shots.called(given[0]),
+            shots.label(given[0]),
             expected="shots",
             found="a scene with poses",
             remedy=f"Leave it out: the scene has developed pictures and cameras.{hint}",
@@ -79,7 +79,7 @@ def priors(
     if formats:
         check_formats(formats)
         for view in chosen:
-            known_places(view.name, view.exposures)
+            known_indices(view.name, view.exposures)
     sheet = write_priors(
         loaded, out, run=run, views=views, refractive_index=index, threshold=threshold, reporter=reporter
     )
@@ -98,24 +98,27 @@ def shot_priors(
     intrinsics: str | None = None,
     reporter: Reporter = SILENT,
 ) -> WrittenShots:
-    """Polarization maps of single shots, without poses: all maps of every shot (``shots.write.write_shots``).
+    """Write the polarization maps of single shots, without poses (see ``polarguide_shots.write.write_shots``).
 
     Args:
-        paths: files and folders of shots as ``find_shots`` takes them.
-        out: folder to write, a folder for each shot in it.
-        refractive_index: of the surfaces; None: as the ``scene.json`` in the only folder says, else 1.5.
-        shots, formats, intrinsics: as ``write_shots`` takes them; None: all formats.
+        paths: files and folders of shots, see ``find_shots``.
+        out: folder to write, with a folder for each shot.
+        refractive_index: refractive index of the surfaces; None: the value in ``scene.json`` of a single folder, else
+            1.5.
+        shots, intrinsics: see ``write_shots``.
+        formats: see ``write_shots``; None: all formats.
+        reporter: receiver of progress and messages.
 
     Raises:
-        PolarguideError: nothing can be read, or an option is wrong or means nothing here.
+        PolarguideError: no shot can be read, or an option is invalid or does not apply.
     """
-    many = [paths] if isinstance(paths, str | os.PathLike) else list(paths)
-    metadata = Path(many[0]) / "scene.json" if len(many) == 1 else None
+    sources = [paths] if isinstance(paths, str | os.PathLike) else list(paths)
+    metadata = Path(sources[0]) / "scene.json" if len(sources) == 1 else None
     stated = None
     if metadata is not None and metadata.is_file():
         stated = refractive_index_of(metadata, read_file(metadata))
     return write_shots(
-        many,
+        sources,
         out,
         shots,
         formats=FORMATS if formats is None else formats,

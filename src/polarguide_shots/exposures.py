@@ -1,4 +1,4 @@
-"""Find the exposure sets behind paths: mosaics, shots through a filter at four or any angles, views of a scene."""
+"""Search for exposure sets in paths: mosaics, shots through a filter at four or any angles, views of a scene."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from polarguide.capture.exposures import TABLE
 from polarguide.capture.filter import shots as filter_shots
 from polarguide.capture.filter.consecutive import VIDEO_SUFFIXES
 from polarguide.capture.layout import (
-    Layout,
+    CaptureFiles,
     angle_folders,
     angle_of_folder,
     describe_contents,
@@ -22,11 +22,11 @@ from polarguide.capture.layout import (
 from polarguide.capture.sensor.pattern import SENSOR_NAMES
 from polarguide.capture.sensor.raw_file import RAW_SUFFIXES
 from polarguide.capture.view import ANGLES
-from polarguide.core.errors import PolarguideError
+from polarguide.core.errors import PolarguideError, require
 from polarguide.core.text import canonical, stem_of
 from polarguide_shots import sets
 from polarguide_shots.options import ShotOptions
-from polarguide_shots.sets import ExposureSet, known_places
+from polarguide_shots.sets import ExposureSet, known_indices
 
 _EXPECTED = "raw mosaics with --sensor, or shots with angles in their names"
 _REMEDY = (
@@ -39,62 +39,68 @@ _REMEDY = (
 def find_shots(
     paths: Sequence[str | os.PathLike[str]], options: ShotOptions | None = None
 ) -> list[ExposureSet]:
-    """The exposure sets behind files and folders, in the order of the paths, sorted within a folder.
+    """Find the exposure sets in files and folders, in the order of the paths, sorted within a folder.
 
-    A file is a mosaic if the options name a sensor; else its name tells shot and angle (``cup_0.png``, ``cup_45.png``;
-    ``I0.png`` ... in one folder; ``0/cup.png`` ...). Pictures of a shot at three or more other angles are a set:
-    ``cup_a10.png``, ``cup_a40.png``, ... or as ``angles.csv`` beside them says, as ``prepare`` reads it; so is a video
-    with a table ``frame,angle`` of its name. A folder is a scene (``polar/``, or four folders of angles with a
-    ``sparse``), or holds mosaics or shots; one without any is looked for in its folders, one level down.
+    A file is a mosaic if the options name a sensor. The name of another file states its shot and angle
+    (``cup_0.png``, ``cup_45.png``; ``I0.png`` ... in one folder; ``0/cup.png`` ...). Pictures of a shot at three or
+    more other angles are a set. Their angles are in the names (``cup_a10.png``, ``cup_a40.png``, ...) or in a table
+    ``angles.csv`` like that of ``prepare``. A video with a table ``frame,angle`` of its name is also a set. A folder is
+    a scene (``polar/``, or four folders of angles next to ``sparse``), or contains mosaics or shots. A folder without
+    shots is searched one level down.
 
-    What is ambiguous or tells no angle does not hide the shots beside it: it is a set with a ``fault``.
+    An ambiguous file, or a file without an angle, is a set with a ``fault``. Other shots are not affected.
+
+    Args:
+        paths: files and folders.
+        options: options of the shots.
 
     Raises:
-        PolarguideError: there are no paths, one does not exist, there is nothing but files and folders that are no
-            shot, or an option means nothing for the kind of shots found.
+        PolarguideError: there are no paths, a path does not exist, no shot is valid, or an option does not apply to the
+            kind of the shots.
     """
     options = options or ShotOptions()
-    if not paths:
-        raise PolarguideError(
-            "paths", expected="at least one file or folder of shots", found="none", remedy="Name some."
-        )
+    require(
+        paths, "paths", expected="at least one file or folder of shots", found="none", remedy="Name some."
+    )
     shots = list_shots(paths, options)
-    faults = [shot.fault for shot in shots if shot.nothing and shot.fault is not None]
+    faults = [shot.fault for shot in shots if shot.empty and shot.fault is not None]
     if len(faults) < len(shots):
         for kind, shot in {shot.kind: shot for shot in reversed(shots) if shot.fault is None}.items():
             options.require_kind(kind, shot.name)
         return shots
-    root = Path(paths[0])
     if len(paths) == 1 and len(faults) > 1:
-        raise PolarguideError(root, expected=_EXPECTED, found=describe_contents(root), remedy=_REMEDY)
+        contents = describe_contents(Path(paths[0]))
+        raise PolarguideError(paths[0], expected=_EXPECTED, found=contents, remedy=_REMEDY)
     raise faults[0]
 
 
 def list_shots(
     paths: Sequence[str | os.PathLike[str]], options: ShotOptions | None = None
 ) -> list[ExposureSet]:
-    """As ``find_shots``, but where there are only faults, these are what is found.
+    """Find exposure sets like ``find_shots``, but return sets with faults even if no set is valid.
+
+    Args:
+        paths: files and folders.
+        options: options of the shots.
 
     Raises:
-        PolarguideError: a path does not exist, or the only one is an empty folder, or one that lacks those of angles.
+        PolarguideError: a path does not exist, or the only path is a folder that is empty or lacks an angle.
     """
     options = options or ShotOptions()
     shots: list[ExposureSet] = []
     files: list[Path] = []
     for path in map(Path, dict.fromkeys(paths)):
-        if path.is_dir():
-            shots += _in_folder(path, options) if len(paths) == 1 else _or_fault(path, options, _in_folder)
-        elif path.is_file():
+        exists = path.is_dir() or path.is_file()
+        require(exists, path, expected="a file or folder of shots", found="none", remedy="Check the path.")
+        if path.is_file():
             files.append(path)
         else:
-            raise PolarguideError(
-                path, expected="a file or folder of shots", found="none", remedy="Check the path."
-            )
-    return _named_apart(_of_files(files, options) + shots)
+            shots += _in_folder(path, options) if len(paths) == 1 else _or_fault(path, options, _in_folder)
+    return _unique_names(_of_files(files, options) + shots)
 
 
 def mosaics(files: Sequence[Path]) -> list[ExposureSet]:
-    """Raw mosaics as sets; two of one folder and stem are called by their suffix, too."""
+    """Create a set of each raw mosaic. The names of files with one folder and stem include their suffix."""
     stems = Counter(path.with_suffix("") for path in files)
     return [
         ExposureSet(
@@ -105,16 +111,16 @@ def mosaics(files: Sequence[Path]) -> list[ExposureSet]:
 
 
 def _of_files(files: list[Path], options: ShotOptions) -> list[ExposureSet]:
+    """Find the sets in files: mosaics, or videos, sets in tables, shots in folders of angles, and shots by names."""
     if options.sensor is not None:
         return mosaics(files)
-    of_videos = sets.videos(files)
+    shots = sets.videos(files)
     files = [path for path in files if path.suffix.lower() not in VIDEO_SUFFIXES]
     for folder in dict.fromkeys(path.parent for path in files if (path.parent / TABLE).is_file()):
         inside = {path.resolve() for path in files if path.parent == folder}
-        for one in sets.by_table(folder)[0]:
-            listed = {path.resolve() for path in one.paths if path != one.table}
-            if listed & inside:
-                of_videos.append(one)
+        for shot in sets.by_table(folder)[0]:
+            listed = {path.resolve() for path in shot.paths if path != shot.table}
+            shots += [shot] if listed & inside else []
             inside -= listed
         files = [path for path in files if path.parent != folder or path.resolve() in inside]
     by_root: dict[Path, filter_shots.Candidates] = {}
@@ -122,23 +128,26 @@ def _of_files(files: list[Path], options: ShotOptions) -> list[ExposureSet]:
         folder = path.resolve().parent
         angle = angle_of_folder(folder)
         if angle is not None:
-            shots = by_root.setdefault(folder.parent, {})
-            shots.setdefault(stem_of(path), {}).setdefault(angle, []).append(path)
-    # Files of one angle are in folders that are called so by chance.
-    in_folders = [c for c in by_root.values() if all(len(angles) > 1 for angles in c.values())]
-    placed = {path for c in in_folders for angles in c.values() for same in angles.values() for path in same}
-    of_videos += [shot for candidates in in_folders for shot in _filter_sets(candidates)]
-    return of_videos + _by_names([path for path in files if path not in placed])
+            views = by_root.setdefault(folder.parent, {})
+            views.setdefault(stem_of(path), {}).setdefault(angle, []).append(path)
+    for views in by_root.values():
+        # A view with one angle means that the folder has the name of an angle by chance.
+        if all(len(angles) > 1 for angles in views.values()):
+            shots += _filter_sets(views)
+            placed = {path for angles in views.values() for same in angles.values() for path in same}
+            files = [path for path in files if path not in placed]
+    return shots + _by_names(files)
 
 
 def _by_names(files: Sequence[Path]) -> list[ExposureSet]:
-    """The sets, the shots of four and the strangers among files, by their names."""
+    """Find sets, shots of four, and faults of other files, by the names of files."""
     named, rest = sets.by_name(files)
     by_name, others = filter_shots.group_files(rest)
-    return [*named, *_filter_sets(by_name), *_strangers(others)]
+    return [*named, *_filter_sets(by_name), *_without_angle(others)]
 
 
 def _filter_sets(shots: filter_shots.Candidates) -> list[ExposureSet]:
+    """Create the sets of four angles. Two files of one angle are a fault."""
     return [
         ExposureSet(
             view,
@@ -151,8 +160,8 @@ def _filter_sets(shots: filter_shots.Candidates) -> list[ExposureSet]:
     ]
 
 
-def _strangers(files: Sequence[Path]) -> list[ExposureSet]:
-    """A fault for each picture whose name tells no angle."""
+def _without_angle(files: Sequence[Path]) -> list[ExposureSet]:
+    """Create a fault for each picture without an angle in its name."""
     return [
         ExposureSet(
             path.name,
@@ -168,35 +177,43 @@ def _strangers(files: Sequence[Path]) -> list[ExposureSet]:
 def _or_fault(
     folder: Path, options: ShotOptions, look: Callable[[Path, ShotOptions], list[ExposureSet]]
 ) -> list[ExposureSet]:
-    """The shots of a folder, or its fault."""
+    """Find the shots of a folder with ``look``, or return its fault."""
     try:
         return look(folder, options)
     except PolarguideError as error:
         fault = error
     except OSError as error:
+        found = error.strerror or str(error)
         fault = PolarguideError(
-            folder,
-            expected="a folder that can be read",
-            found=error.strerror or str(error),
-            remedy="Check its permissions.",
+            folder, expected="a readable folder", found=found, remedy="Check its permissions."
         )
     return [ExposureSet(folder.resolve().name, "filter", {}, fault=fault, others=(folder,))]
 
 
 def _in_folder(root: Path, options: ShotOptions) -> list[ExposureSet]:
+    """Find the shots in a folder, or in its folders if it has no valid shot.
+
+    Raises:
+        PolarguideError: there are no shots.
+    """
     shots = _directly_in(root, options)
-    if all(shot.nothing for shot in shots):
+    if all(shot.empty for shot in shots):
         folders = sorted(path for path in root.iterdir() if path.is_dir() and not path.name.startswith("."))
         for folder in folders:
             inside = _or_fault(folder, options, _directly_in)
-            alone = len(inside) == 1 and inside[0].name == folder.resolve().name
-            shots += inside if alone else [replace(s, name=f"{folder.name}_{s.name}") for s in inside]
+            same_name = [shot.name for shot in inside] == [folder.resolve().name]
+            shots += inside if same_name else [replace(s, name=f"{folder.name}_{s.name}") for s in inside]
     if not shots:
         raise PolarguideError(root, expected="shots", found=describe_contents(root), remedy=_REMEDY)
     return shots
 
 
 def _directly_in(root: Path, options: ShotOptions) -> list[ExposureSet]:
+    """Find the shots in a folder without its folders.
+
+    Raises:
+        PolarguideError: the folder is an invalid scene, or its table cannot be read.
+    """
     if (root / "polar").is_dir() or ((root / "sparse").is_dir() and len(angle_folders(root)) == len(ANGLES)):
         return _views(find_layout(root))
     if options.sensor is not None and not angle_folders(root):
@@ -206,22 +223,21 @@ def _directly_in(root: Path, options: ShotOptions) -> list[ExposureSet]:
     videos = sets.videos(list_files(root, VIDEO_SUFFIXES))
     if (root / TABLE).is_file():
         listed, others = sets.by_table(root)
-        return [*videos, *listed, *_strangers(others)]
+        return [*videos, *listed, *_without_angle(others)]
     files = list_files(root, filter_shots.SHOT_SUFFIXES)
     in_folders = [] if files else sets.by_folder(root)
     if in_folders:
         return [*videos, *in_folders]
     if not angle_folders(root):
         return videos + _by_names(files)
-    shots, _ = filter_shots.list_shots(root)
-    return videos + _filter_sets(shots)
+    return videos + _filter_sets(filter_shots.list_shots(root)[0])
 
 
-def _views(layout: Layout) -> list[ExposureSet]:
-    """The views of a scene; a fault for each whose pictures do not determine Stokes vectors.
+def _views(layout: CaptureFiles) -> list[ExposureSet]:
+    """Create the sets of the views of a scene. Pictures that do not determine Stokes vectors are a fault.
 
     Raises:
-        PolarguideError: there is no other view.
+        PolarguideError: no view is valid.
     """
     shots = []
     for name in layout.names:
@@ -229,36 +245,36 @@ def _views(layout: Layout) -> list[ExposureSet]:
         fault = None
         if others:
             try:
-                known_places(name, [exposure for _, exposure in others])
+                known_indices(name, [exposure for _, exposure in others])
             except PolarguideError as error:
                 fault = error
         files = layout.pictures.get(name, {})
         more = tuple(path for path, _ in others)
         shots.append(ExposureSet(name, "scene", files, layout.root, name, fault, more))
-    if shots and all(shot.fault is not None for shot in shots):
-        assert shots[0].fault is not None
-        raise shots[0].fault
+    faults = [shot.fault for shot in shots if shot.fault is not None]
+    if shots and len(faults) == len(shots):
+        raise faults[0]
     return shots
 
 
-def _named_apart(shots: list[ExposureSet]) -> list[ExposureSet]:
-    """Sets of one name are called by their folder, too; it is their fault where that does not tell them apart.
-
-    So is a name that a folder cannot have.
-    """
-    shots = [replace(shot, fault=shot.fault or name_fault(shot)) for shot in shots]
-    names = Counter(shot.name for shot in shots)
-    apart = [
-        shot
-        if names[shot.name] == 1
-        else replace(shot, name=f"{(shot.root or shot.paths[0].resolve().parent).name}_{shot.name}")
+def _unique_names(shots: list[ExposureSet]) -> list[ExposureSet]:
+    """Add the folder to equal names. Names that are still equal, or invalid for a folder, are a fault."""
+    counts = Counter(shot.name for shot in shots)
+    unique = [
+        replace(
+            shot,
+            name=shot.name
+            if counts[shot.name] == 1
+            else f"{(shot.root or shot.paths[0].resolve().parent).name}_{shot.name}",
+            fault=shot.fault or name_fault(shot),
+        )
         for shot in shots
     ]
-    named: dict[str, list[ExposureSet]] = {}
-    for shot in apart:
-        named.setdefault(shot.name, []).append(shot)
-    for place, shot in enumerate(apart):
-        others = [other for other in named[shot.name] if other is not shot]
+    by_name: dict[str, list[ExposureSet]] = {}
+    for shot in unique:
+        by_name.setdefault(shot.name, []).append(shot)
+    for place, shot in enumerate(unique):
+        others = [other for other in by_name[shot.name] if other is not shot]
         if others:
             fault = PolarguideError(
                 shot.paths[0],
@@ -266,51 +282,46 @@ def _named_apart(shots: list[ExposureSet]) -> list[ExposureSet]:
                 found=f"{shot.name} also at {others[0].paths[0]}",
                 remedy="Rename one of them, or give them in two calls.",
             )
-            apart[place] = replace(shot, fault=shot.fault or fault)
-    return apart
+            unique[place] = replace(shot, fault=shot.fault or fault)
+    return unique
 
 
 def name_fault(shot: ExposureSet) -> PolarguideError | None:
-    """Return the error of a shot whose name cannot name a folder: its files would be written elsewhere."""
+    """Return the error of a name that is invalid for a folder, because files would be written elsewhere."""
     name = shot.name
     if name not in ("", ".", "..") and os.sep not in name and not (os.altsep and os.altsep in name):
         return None
-    return PolarguideError(
-        shot.paths[0],
-        expected="a name that a folder can have",
-        found=repr(shot.name),
-        remedy="Rename the file.",
-    )
+    expected = "a name that is valid for a folder"
+    return PolarguideError(shot.paths[0], expected=expected, found=repr(name), remedy="Rename the file.")
 
 
 def require_own_folder(shot: ExposureSet, folder: Path) -> None:
-    """Refuse to write the maps of a shot beside its files: one of them may have the name of a map.
+    """Check that no file of a shot is in the folder of its maps, where it may have the name of a map.
 
     Raises:
-        PolarguideError: a file of the shot lies in ``folder``.
+        PolarguideError: a file of the shot is in ``folder``.
     """
-    written = os.path.realpath(folder)
     for path in shot.paths:
-        if os.path.dirname(os.path.realpath(path)) == written:
-            raise PolarguideError(
-                path,
-                expected=f"a shot outside of {folder}, where its maps go",
-                found="that it lies there",
-                remedy="Give another --out.",
-            )
+        require(
+            os.path.dirname(os.path.realpath(path)) != os.path.realpath(folder),
+            path,
+            expected=f"a shot outside of {folder}, the folder of its maps",
+            found="a file inside",
+            remedy="Give another --out.",
+        )
 
 
 def require_elsewhere(paths: Sequence[str | os.PathLike[str]], out: Path) -> None:
-    """Refuse to write among shots: the next call would take what was written for shots.
+    """Check that the output folder is not searched for shots. The next call would read the written files as shots.
 
     Raises:
-        PolarguideError: ``out`` is one of the folders that are looked through.
+        PolarguideError: ``out`` is one of the searched folders.
     """
     for path in paths:
-        if os.path.isdir(path) and os.path.realpath(path) == os.path.realpath(out):
-            raise PolarguideError(
-                out,
-                expected="a folder that is not searched for shots",
-                found="that of the shots",
-                remedy="Give another --out.",
-            )
+        require(
+            not (os.path.isdir(path) and os.path.realpath(path) == os.path.realpath(out)),
+            out,
+            expected="a folder that is not searched for shots",
+            found="the folder of the shots",
+            remedy="Give another --out.",
+        )

@@ -1,4 +1,4 @@
-"""Weighted least squares of a set at any angles, pixel by pixel: Stokes vectors, their covariance, and outliers."""
+"""Maps of a set of pictures at any angles: noise, weighted least squares of each pixel, covariance and outliers."""
 
 from __future__ import annotations
 
@@ -13,30 +13,89 @@ from scipy.special import erfcinv
 
 from polarguide import optics
 from polarguide.capture.exposures import WELL_CONDITIONED
-from polarguide.capture.picture_sets import SetSamples, chosen_pixels, judge, mean_color
+from polarguide.capture.picture_sets import (
+    SetLimits,
+    SetSamples,
+    chosen_pixels,
+    judge,
+    mean_color,
+    typical_variance,
+)
 from polarguide.geometry.polarizer import four_intensities
-from polarguide_shots.maps import NoiseModel, Reason, ShotMaps, given_noise
+from polarguide_shots.maps import NoiseModel, Reason, ShotMaps, binned_noise, given_noise
 from polarguide_shots.options import ShotOptions
-from polarguide_shots.set_noise import estimated_set_noise, neighbor_noise
+
+Floats = NDArray[np.float64]
+_REDUNDANT = 0.05
+"""Smallest share of a sample's noise in the residual of a fit from which noise is estimated."""
+
+
+def estimated_set_noise(samples: SetSamples, gray: Floats, used: NDArray[np.bool_]) -> NoiseModel:
+    """Fit ``floor + slope * intensity`` to the residuals of the pictures of a set.
+
+    The expected sum of squared residuals of a pixel is the sum of (1 - h) times the variances of its samples with the
+    leverages h. It therefore measures the noise at the mean intensity with these weights. The median in each bin of
+    brightness is robust against moved edges.
+
+    Args:
+        samples: the set.
+        gray: luminance [K, N] at some pixels.
+        used: mask [K] of the pictures that are fitted.
+    """
+    least = samples.step**2 / 12 / samples.values.shape[-1]
+    rows = samples.rows[used].astype(np.float64)
+    hat = rows @ np.linalg.pinv(rows)
+    free = 1 - np.diag(hat)
+    freedom = int(used.sum()) - 3
+    if freedom < 1 or gray.shape[1] < SetLimits.fewest_pixels or free.max() < _REDUNDANT:
+        return NoiseModel(least, 0.0, "estimated")
+    gains = samples.gains[used].astype(np.float64)
+    fitted = hat @ gray[used]
+    squares = ((gray[used] - fitted) ** 2).sum(axis=0)
+    flat = float((free / gains**2).sum())
+    level = (free / gains) @ np.maximum(fitted, 0) / flat
+    return binned_noise(level, lambda part: typical_variance(squares[part], freedom) * freedom / flat, least)
+
+
+def neighbor_noise(samples: SetSamples) -> NoiseModel:
+    """Fit ``floor + slope * intensity`` to differences of neighboring pixels, for sets without residuals.
+
+    The difference of a pixel and the mean of its left and right neighbor has 3/2 of its variance. Texture adds to it:
+    the result is an upper bound of the noise.
+    """
+    least = samples.step**2 / 12 / samples.values.shape[-1]
+    height, width = samples.dark.shape
+    step = max(1, height // max(1, 20 * SetLimits.most_pixels // max(width, 1)))
+    bad = samples.lost[:, ::step] | samples.dark[::step] | samples.masked[::step]
+    good = ~(bad[..., :-2] | bad[..., 1:-1] | bad[..., 2:])
+    pictures = samples.gains.astype(np.float64)[:, None, None] * samples.gray(np.s_[::step])
+    level = pictures[..., 1:-1][good]
+    differences = (pictures[..., 1:-1] - (pictures[..., :-2] + pictures[..., 2:]) / 2)[good]
+    if len(level) < SetLimits.fewest_pixels:
+        return NoiseModel(least, 0.0, "estimated")
+    return binned_noise(level, lambda part: typical_variance(differences[part] ** 2, 1) / 1.5, least)
+
 
 FALSE_ALARMS = 1e-3
 """Share of pixels of pure noise that lose a sample as an outlier."""
 DARK_SNR = 3.0
-"""S0 in units of its noise from which on there is light."""
+"""Smallest S0 of a pixel that is not dark, in units of its noise."""
 _TILE = 1 << 14
-"""Pixels that are fitted at a time, so that 36 pictures of them stay in the processor's cache."""
+"""Batch size in pixels. The samples of 36 pictures then fit into the processor's cache."""
 _PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
-"""Places in a symmetric matrix, in the order of ``optics.fitted_uncertainty``."""
+"""Indices into a symmetric matrix, in the order of ``optics.fitted_uncertainty``."""
 Array = NDArray[np.float32]
 
 
 @dataclass(eq=False)
 class SetFit:
-    """The fit of some pixels.
+    """Fit of some pixels.
 
     Attributes:
-        stokes: [3, N] of the luminance. covariance: [6, N].
-        weights: [K, N], 0 for samples that are left out. determined: [N].
+        stokes: [3, N] of the luminance.
+        covariance: [6, N], in the order of ``_PAIRS``.
+        weights: [K, N], 0 for samples that are left out.
+        determined: mask [N] of pixels whose samples determine a Stokes vector.
     """
 
     stokes: Array
@@ -46,57 +105,67 @@ class SetFit:
 
 
 class SetModel:
-    """Malus's law at the angles of a set, with the noise of its samples."""
+    """Malus's law at the angles of a set, with the noise of its samples.
+
+    Args:
+        samples: the set.
+        used: mask [K] of the pictures that are fitted.
+        noise: noise of a sample.
+        share: variance of a luminance over the variance of a sample.
+    """
 
     def __init__(self, samples: SetSamples, used: NDArray[np.bool_], noise: NoiseModel, share: float) -> None:
-        """Take the pictures that are ``used``; ``share``: variance of a luminance over that of a sample."""
         self.rows = samples.rows
         self._used = used
         self._squares = np.stack([self.rows[:, i] * self.rows[:, j] for i, j in _PAIRS])
         gains = samples.gains[:, None]
         self._floor = np.float32(noise.floor * share) / gains**2
         self._slope = np.float32(noise.slope * share) / gains
-        self._limit = 2 * float(erfcinv(FALSE_ALARMS / len(used))) ** 2  # the square of it, two-sided
+        self._limit = 2 * float(erfcinv(FALSE_ALARMS / len(used))) ** 2  # squared, two-sided
 
     def variances(self, stokes: Array) -> Array:
-        """Variances [K, N] of the samples of Stokes vectors [3, N]."""
+        """Predict the variances [K, N] of the samples of Stokes vectors [3, N]."""
         return np.asarray(self._floor + self._slope * np.maximum(self.rows @ stokes, 0), np.float32)
 
     def fit(self, gray: Array, lost: NDArray[np.bool_]) -> SetFit:
-        """Fit pixels [K, N]: least squares, then with the variances that these predict, then without outliers."""
+        """Fit pixels by least squares, repeat with the predicted variances, and remove outliers.
+
+        Args:
+            gray: luminance [K, N].
+            lost: mask [K, N] of clipped samples.
+        """
         usable = (~lost & self._used[:, None]).astype(np.float32)
         determined = self._determined(usable)
-        usable[:, ~determined] = 1  # something has to be drawn there, too
+        usable[:, ~determined] = 1  # pictures show a fit at these pixels as well
         stokes, _ = self._solve(usable, gray)
         weights = usable / self.variances(stokes)
-        stokes, covariance = self._solve(weights, gray)
-        fit = SetFit(stokes, covariance, weights, determined)
+        fit = SetFit(*self._solve(weights, gray), weights, determined)
         self._drop_outliers(gray, fit)
         return fit
 
     def _drop_outliers(self, gray: Array, fit: SetFit) -> None:
-        """Leave out the sample that is off most, pixel by pixel, while one is off by more than noise is."""
+        """Remove the sample with the largest residual of each pixel, while a residual exceeds the noise."""
         doubled = self._squares * np.array([[1], [2], [2], [1], [2], [1]], np.float32)
         at = np.flatnonzero(fit.determined)
         while at.size:
-            # Of four samples nobody can tell which is wrong: all are equally far off.
+            # Four samples have equal residuals, which do not identify an outlier.
             at = at[(fit.weights[:, at] > 0).sum(axis=0) >= 5]
             weights = fit.weights[:, at]
-            off = gray[:, at] - self.rows @ fit.stokes[:, at]
             leverage = weights * (doubled.T @ fit.covariance[:, at])
-            far = off**2 * weights / np.maximum(1 - leverage, 1e-3)
-            worst = far.argmax(axis=0)
-            beyond = np.flatnonzero(far[worst, np.arange(at.size)] > self._limit)
-            weights = weights[:, beyond]
-            weights[worst[beyond], np.arange(beyond.size)] = 0
+            squares = (gray[:, at] - self.rows @ fit.stokes[:, at]) ** 2
+            residuals = squares * weights / np.maximum(1 - leverage, 1e-3)
+            worst = residuals.argmax(axis=0)
+            outliers = np.flatnonzero(residuals[worst, np.arange(at.size)] > self._limit)
+            weights = weights[:, outliers]
+            weights[worst[outliers], np.arange(outliers.size)] = 0
             determined = self._determined((weights > 0).astype(np.float32))
             weights = weights[:, determined]
-            at = at[beyond[determined]]
+            at = at[outliers[determined]]
             fit.weights[:, at] = weights
             fit.stokes[:, at], fit.covariance[:, at] = self._solve(weights, gray[:, at])
 
     def _determined(self, usable: Array) -> NDArray[np.bool_]:
-        """Whether the samples that are used, [K, N] of 0 and 1, determine a Stokes vector well, [N]."""
+        """Return a mask [N] of pixels whose samples, [K, N] of 0 and 1, determine a Stokes vector well."""
         determined = np.ones(usable.shape[1], bool)
         some = np.flatnonzero(usable.sum(axis=0) < self._used.sum())
         if some.size:
@@ -109,7 +178,7 @@ class SetModel:
         return determined
 
     def _solve(self, weights: Array, values: Array) -> tuple[Array, Array]:
-        """Weighted least squares of [K, N]: Stokes vectors [3, N], and the inverse [6, N] of the normal matrix."""
+        """Solve weighted least squares of [K, N]: Stokes vectors [3, N], and the inverse normal matrix [6, N]."""
         a, b, c, d, e, f = (self._squares @ weights).astype(np.float64)
         # Cofactors of the symmetric matrix ((a, b, c), (b, d, e), (c, e, f)).
         inverse = np.stack(
@@ -119,23 +188,28 @@ class SetModel:
         return self.project(inverse, weights, values), inverse.astype(np.float32)
 
     def project(self, inverse: NDArray[Any], weights: Array, values: Array) -> Array:
-        """The Stokes vectors [3, N] of samples [K, N], with the inverse of the normal matrix."""
+        """Return the Stokes vectors [3, N] of samples [K, N], given the inverse normal matrix."""
         x, y, z = (self.rows.T @ (weights * values)).astype(np.float64)
         p, q, r, s, t, u = inverse
-        return np.stack((p * x + q * y + r * z, q * x + s * y + t * z, r * x + t * y + u * z)).astype(
-            np.float32
-        )
+        stokes = np.stack((p * x + q * y + r * z, q * x + s * y + t * z, r * x + t * y + u * z))
+        return stokes.astype(np.float32)
 
     def residual(self, gray: Array, stokes: Array) -> Array:
-        """Root mean square of what is left of all samples, [N]: in standard deviations, per degree of freedom."""
-        off = (gray - self.rows @ stokes) ** 2 / self.variances(stokes)
-        return np.sqrt(off.sum(axis=0) / (len(gray) - 3))
+        """Return the root mean square residual of all samples, [N], in standard deviations per degree of freedom."""
+        squares = (gray - self.rows @ stokes) ** 2 / self.variances(stokes)
+        return np.sqrt(squares.sum(axis=0) / (len(gray) - 3))
 
 
 def maps_of_set(name: str, files: tuple[Path, ...], samples: SetSamples, options: ShotOptions) -> ShotMaps:
-    """Return the maps of a set of pictures at any angles."""
-    chosen = chosen_pixels(samples)
-    gray = samples.gray(chosen).astype(np.float64)
+    """Compute the maps of a set of pictures at any angles.
+
+    Args:
+        name: name of the shot.
+        files: files of the shot.
+        samples: the pictures.
+        options: options of the shot.
+    """
+    gray = samples.gray(chosen_pixels(samples)).astype(np.float64)
     judgment = judge(samples, gray)
     notes = [*samples.notes, *judgment.notes]
     noise = given_noise(options, samples.step)
@@ -146,14 +220,16 @@ def maps_of_set(name: str, files: tuple[Path, ...], samples: SetSamples, options
     elif noise is None:
         noise = neighbor_noise(samples)
         notes.append(
-            "Three pictures leave no residual: the noise is that of neighboring pixels (--full-well states it)."
+            "Three pictures have no residuals. The noise is estimated from neighboring pixels; --full-well states it."
         )
     size = (height, width)
-    maps: dict[str, Any] = {key: np.zeros(size, np.float32) for key in _FLOAT_MAPS}
-    maps["intensities"] = np.empty((4, *size, channels), np.float32)
-    maps["stokes"] = np.empty((3, *size), np.float32)
-    maps["reason"] = np.zeros(size, np.uint8)
-    maps["left_out"] = np.zeros(size, np.uint8)
+    shapes: dict[str, tuple[int, ...]] = {
+        **dict.fromkeys(_FLOAT_MAPS, size),
+        "intensities": (4, *size, channels),
+        "stokes": (3, *size),
+    }
+    maps: dict[str, Any] = {key: np.zeros(shape, np.float32) for key, shape in shapes.items()}
+    maps |= {key: np.zeros(size, np.uint8) for key in ("reason", "left_out")}
     model = SetModel(samples, judgment.used, noise, share)
     rows = max(1, _TILE // width)
     for top in range(0, height, rows):
@@ -172,11 +248,19 @@ def maps_of_set(name: str, files: tuple[Path, ...], samples: SetSamples, options
 
 
 _FLOAT_MAPS = ("dolp", "dolp_debiased", "aolp", "sigma_dolp", "sigma_aolp", "residual")
-"""Maps [H, W] of 32-bit floats."""
+"""Names of the maps [H, W] of 32-bit floats."""
 
 
 def _fill(maps: dict[str, Any], part: slice, samples: SetSamples, model: SetModel, snr: float) -> None:
-    """Fit the pixels of some rows: intensities, DoLP and AoLP with uncertainty, and pixels without information."""
+    """Fit the pixels of some rows, and store their values in the maps.
+
+    Args:
+        maps: maps by name.
+        part: the rows.
+        samples: the pictures.
+        model: angles and noise of the pictures.
+        snr: smallest DoLP of a pixel with a valid angle, in standard deviations.
+    """
     values = samples.intensities(part)
     count, height, width, channels = values.shape
     flat = values.reshape(count, -1, channels)
@@ -186,21 +270,17 @@ def _fill(maps: dict[str, Any], part: slice, samples: SetSamples, model: SetMode
         model.project(fit.covariance, fit.weights, np.ascontiguousarray(flat[..., c])) for c in range(channels)
     ]  # fmt: skip
     size = (height, width)
-    for channel, of_color in enumerate(colors):
-        for place, intensity in enumerate(four_intensities(of_color)):
+    for channel, color in enumerate(colors):
+        for place, intensity in enumerate(four_intensities(color)):
             maps["intensities"][place, part, :, channel] = intensity.reshape(size)
     stokes = torch.from_numpy(fit.stokes)
     spread = optics.fitted_uncertainty(stokes, torch.from_numpy(fit.covariance))
     degree = optics.dolp(stokes)
     maps["stokes"][:, part] = fit.stokes.reshape(3, *size)
-    found = {
-        "dolp": degree,
-        "aolp": optics.aolp(stokes),
-        "sigma_dolp": spread.dolp,
-        "sigma_aolp": spread.aolp,
-        "dolp_debiased": spread.debiased,
-    }
-    for key, tensor in found.items():
+    angle = optics.aolp(stokes)
+    for key, tensor in zip(
+        _FLOAT_MAPS, (degree, spread.debiased, angle, spread.dolp, spread.aolp), strict=False
+    ):
         maps[key][part] = tensor.reshape(size).numpy()
     if count > 3:
         maps["residual"][part] = model.residual(gray, fit.stokes).reshape(size)

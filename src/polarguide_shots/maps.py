@@ -1,4 +1,4 @@
-"""Maps of one exposure set: one for each quantity, their pictures, and the reasons why a pixel has no value."""
+"""Maps of one exposure set, the reasons against a pixel, and the noise of samples."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Map = NDArray[np.float32]
 
 
 class Reason(enum.IntEnum):
-    """Why a pixel says nothing; of several reasons the last in this list is given."""
+    """Reasons why a pixel has no valid angle. A later reason replaces an earlier one."""
 
     USABLE = 0
     NOISE = 1
@@ -34,11 +34,11 @@ class Reason(enum.IntEnum):
 REASONS = {
     Reason.USABLE: "usable",
     Reason.NOISE: "noise: the degree of polarization is not above its noise",
-    Reason.DARK: "dark: there is no light to be told from the noise",
-    Reason.SATURATED: "saturated: a sample that the pixel is made from is at full scale",
+    Reason.DARK: "dark: the light is not above the noise",
+    Reason.SATURATED: "saturated: a sample of the pixel is at full scale",
     Reason.MASKED: "masked: marked as invalid, or outside of the mask",
 }
-"""The reasons in words."""
+"""Descriptions of the reasons."""
 
 
 @dataclass(frozen=True)
@@ -47,8 +47,8 @@ class NoiseModel:
 
     Attributes:
         floor: variance without light (read-out, quantization), in full scales squared.
-        slope: full scales of variance per full scale of intensity: 1 / electrons at full scale.
-        source: where it is from: "given" or "estimated".
+        slope: full scales of variance per full scale of intensity, 1 / electrons at full scale.
+        source: "given" by the user or "estimated" from the picture.
     """
 
     floor: float
@@ -58,41 +58,40 @@ class NoiseModel:
 
 @dataclass(frozen=True, eq=False)
 class ShotMaps:
-    """The maps of one shot; NumPy arrays at the size of the developed picture.
+    """Maps of one shot, NumPy arrays at the size of the developed picture.
 
-    DoLP and AoLP of a color picture are those of its luminance, the plain mean of the Stokes vectors of R, G and B;
-    angles and degrees are never averaged. The colors themselves are in ``intensities``.
+    DoLP and AoLP of a color picture refer to its luminance, the plain mean of the Stokes vectors of R, G and B. Angles
+    and degrees of polarization are never averaged. The colors are in ``intensities``.
 
     Attributes:
         name: name of the shot.
-        files: it was read from, in the order 0, 45, 90, 135 where there are four.
+        files: files of the shot; four files are in the order 0, 45, 90, 135.
         intensities: [4, H, W, C] float32, linear, at 0, 45, 90 and 135 degrees, counter-clockwise as displayed; 1 is
-            full scale; noise about black may be negative. C is 3 (R, G, B) or 1 (monochrome). Of a set at other angles
-            those that the fitted Stokes vectors have.
+            full scale. Noise about black may be negative. C is 3 (R, G, B) or 1 (monochrome). For a set at other
+            angles, the intensities follow from the fitted Stokes vectors.
         stokes: [3, H, W] float32, of the luminance. S0 is 2 where all four intensities are at full scale; a photograph
             shows S0 / 2.
         dolp: [H, W] float32 in [0, 1], as measured.
-        dolp_debiased: [H, W] float32 in [0, 1], without what noise adds to it on average.
+        dolp_debiased: [H, W] float32 in [0, 1], without the mean bias by noise.
         aolp: [H, W] float32, radians in [0, pi).
-        sigma_dolp: [H, W] float32, standard deviation of ``dolp``; infinite where there is no light.
-        sigma_aolp: [H, W] float32, of ``aolp``, radians, at most ``optics.UNIFORM_SPREAD``.
-        reason: [H, W] uint8, a ``Reason``. NOISE pixels do have an S0 and a (small) DoLP: means of these over a region
-            take them in; they say nothing of an angle or a normal.
+        sigma_dolp: [H, W] float32, standard deviation of ``dolp``; infinite without light.
+        sigma_aolp: [H, W] float32, standard deviation of ``aolp``, radians, at most ``optics.UNIFORM_SPREAD``.
+        reason: [H, W] uint8, a ``Reason``. NOISE pixels have a valid S0 and a small DoLP, which count in means over a
+            region. Their angles and normals are not valid.
         noise: noise of one sample of the sensor.
-        pair_ratio: median of (I0 + I90) / (I45 + I135), which is 1 for ideal polarizers; None where it is too dark, and
-            of a set at other angles.
-        notes: what was assumed, for the user.
-        pictures: what the pictures of a set at any angles say of their angles; empty for others.
-        residual: [H, W] float32, of a set of more than three pictures: root mean square of what the fit leaves of all
-            its samples, in standard deviations of their noise and per degree of freedom. 1 is noise alone; motion,
-            clipping and wrong angles are more. None for others.
-        left_out: [H, W] uint8, of a set: samples that were not fitted, at full scale or against the others. None for
-            others.
+        pair_ratio: median of (I0 + I90) / (I45 + I135), 1 for ideal polarizers; None for a dark shot or a set.
+        notes: assumptions, for the user.
+        pictures: comparison of the pictures of a set with one another; empty for other shots.
+        residual: [H, W] float32, root mean square residual of the fit of more than three pictures, in standard
+            deviations of their noise and per degree of freedom. Noise alone gives 1; motion, clipping and wrong angles
+            give more. None for other shots.
+        left_out: [H, W] uint8, number of samples of a set that were not fitted because they are clipped or outliers;
+            None for other shots.
         pixel_variance: mean variance of a developed intensity (of the luminance), in variances of a sample.
-        mean_variance: that of the mean of many developed intensities, times their number: more, as neighbors share
-            samples. None of a set at other angles.
-        origin: column and row of the whole picture at which the maps begin.
-        whole: width and height of the whole picture, where only a part of it was developed; None: the maps are all.
+        mean_variance: variance of the mean of many developed intensities, times their number. It exceeds
+            ``pixel_variance`` because neighbors share samples. None for a set.
+        origin: column and row of the first pixel of the maps in the developed picture.
+        whole: width and height of the developed picture if the maps are a part of it, else None.
     """
 
     name: str
@@ -128,12 +127,12 @@ class ShotMaps:
 
     @property
     def usable(self) -> NDArray[np.bool_]:
-        """Pixels with an angle: no reason against them, [H, W]."""
+        """Mask of the pixels with a valid angle, [H, W]."""
         return np.asarray(self.reason == Reason.USABLE)
 
     @property
     def measured(self) -> NDArray[np.bool_]:
-        """Pixels with a trustworthy S0 and DoLP, [H, W]: usable ones, and those of too small a DoLP for an angle."""
+        """Mask of the pixels with a valid S0 and DoLP, [H, W]: usable pixels, and pixels with the reason NOISE."""
         return np.asarray(self.reason <= Reason.NOISE)
 
     @property
@@ -147,11 +146,11 @@ _SAMPLES = 400_000
 _BINS = 24
 _FEWEST = 200
 _REACH = 16
-"""Pixels between two impulses, more than twice what any interpolation reaches."""
+"""Pixels between two impulses, more than twice the reach of any interpolation."""
 
 
 def given_noise(options: ShotOptions, step: float) -> NoiseModel | None:
-    """The model of the options, None where they give none. ``step``: one stored value as a share of full scale."""
+    """Return the noise that the options state, or None. ``step``: one stored value as a share of full scale."""
     if options.full_well is None:
         return None
     read = options.read_noise / options.full_well
@@ -159,16 +158,16 @@ def given_noise(options: ShotOptions, step: float) -> NoiseModel | None:
 
 
 def estimated_noise(intensities: Any, usable: NDArray[np.bool_], step: float) -> NoiseModel:
-    """Fit ``floor + slope * intensity`` to how far ``I0 + I90`` is off ``I45 + I135``.
+    """Fit ``floor + slope * intensity`` to the variance of ``I0 + I90 - I45 - I135``.
 
-    Four angles measure three unknowns: the difference is zero but for noise, whose variance it has four times (linear
-    gradients cancel, too, in a cell of four pixels). Its spread is taken about the median in bins of brightness, so
-    that unequal gains do not count, and by the median of absolute differences, so that edges hardly do.
+    Four angles measure three unknowns. The difference is therefore zero except for noise, and has four times the
+    variance of a sample. Linear gradients cancel in a cell of four pixels. The median in each bin of brightness removes
+    unequal gains. The median of absolute differences is robust against edges.
 
     Args:
-        intensities: four arrays [N] (or any one shape), by angle; of cells or of pixels.
-        usable: in this shape, neither dark nor saturated.
-        step: one stored value as a share of full scale; less noise than it hides is not believed.
+        intensities: four arrays of one shape, by angle, of cells or of pixels.
+        usable: mask in this shape of samples that are neither dark nor saturated.
+        step: one stored value as a share of full scale, which bounds the noise from below.
     """
     chosen = np.flatnonzero(usable)
     chosen = chosen[:: max(1, len(chosen) // _SAMPLES)]
@@ -178,7 +177,7 @@ def estimated_noise(intensities: Any, usable: NDArray[np.bool_], step: float) ->
     i0, i45, i90, i135 = (np.ravel(i)[chosen].astype(np.float64) for i in intensities)
     mean = (i0 + i45 + i90 + i135) / 4
     excess = i0 + i90 - i45 - i135
-    # Whole numbers have no fine quantiles: even noise of one step makes them so, and is taken off again.
+    # Integers have no fine quantiles. Uniform noise of one step smooths them, and is subtracted below.
     excess += np.random.default_rng(0).uniform(-0.5, 0.5, len(excess)) * step
 
     def variance(part: NDArray[np.intp]) -> float:
@@ -191,11 +190,12 @@ def estimated_noise(intensities: Any, usable: NDArray[np.bool_], step: float) ->
 def binned_noise(
     levels: NDArray[np.float64], variance: Callable[[NDArray[np.intp]], float], least: float
 ) -> NoiseModel:
-    """The noise of samples by their variances in bins of brightness.
+    """Fit the noise of samples to their variances in bins of brightness.
 
     Args:
-        levels: intensities of the samples, [N]. variance: gives that of some samples, by their places.
-        least: variance that is believed at least.
+        levels: intensities of the samples, [N].
+        variance: function of indices of samples that returns their variance.
+        least: lower bound of the variance.
     """
     parts = np.array_split(np.argsort(levels), min(_BINS, max(1, len(levels) // _FEWEST)))
     means = np.array([levels[part].mean() for part in parts])
@@ -204,7 +204,7 @@ def binned_noise(
 
 
 def noise_line(x: NDArray[np.float64], y: NDArray[np.float64], least: float) -> tuple[float, float]:
-    """Floor and slope, neither negative, of the line through variances; errors of a variance grow with it."""
+    """Fit a line with nonnegative floor and slope to variances, whose errors are proportional to them."""
     weight = 1 / y
     floor = float(y.mean())
     slope = 0.0
@@ -224,18 +224,20 @@ def noise_line(x: NDArray[np.float64], y: NDArray[np.float64], least: float) -> 
 
 @lru_cache(maxsize=8)
 def interpolation_factors(sensor: str, x: int, y: int, mode: str) -> tuple[NDArray[np.float32], float]:
-    """Variance of developed intensities, as a multiple of a sample's: of each, and of the mean of many.
+    """Compute the variance of developed intensities as a multiple of the variance of a sample.
 
     Interpolated values are means of samples and have less noise. The weights of the samples are the responses of the
-    demosaicing to an impulse at each position of the pattern. Guided interpolation, which is not linear, is taken to be
-    bilinear, and luminance as the mean of the colors.
+    demosaicing to an impulse at each position of the pattern. Guided interpolation, which is not linear, is treated as
+    bilinear. Luminance is the mean of the colors.
 
     Args:
-        sensor: name of the sensor. x, y: column and row at which its pattern begins. mode: of demosaicing.
+        sensor: name of the sensor.
+        x, y: column and row of the first sample in the sensor.
+        mode: mode of demosaicing.
 
     Returns:
-        Factors [4, p, p] over a period p of the pattern. Variance of the mean of many intensities times their number:
-        more than the mean of the factors, as interpolated neighbors share samples.
+        Factors [4, p, p] over a period p of the pattern, and the variance of the mean of many intensities times their
+        number. The latter exceeds the mean of the factors because interpolated neighbors share samples.
     """
     pattern = sensor_pattern(sensor).shifted(x, y)
     side = 4 * _REACH
@@ -244,22 +246,20 @@ def interpolation_factors(sensor: str, x: int, y: int, mode: str) -> tuple[NDArr
     cell = max(pattern.period, step)
     inner = slice(_REACH // step, 2 * _REACH // step)
     summed = np.zeros(len(ANGLES))
-    # Half size is the mean over cells of full size, but for S0, of whose noise DoLP and AoLP hardly depend.
+    # Half size is the mean over cells of full size, except for S0, whose noise hardly affects DoLP and AoLP.
     way = "quarter" if mode == "quarter" else "full"
     squares = np.zeros((len(ANGLES), side // step, side // step))
     for row, column in np.ndindex(cell, cell):
         picture = np.zeros((side, side), np.float32)
         picture[row::_REACH, column::_REACH] = 1
-        nothing = np.zeros(picture.shape, bool)
-        done = demosaic(
-            picture, nothing, pattern, mode=way, interpolation="bilinear", colored=False
-        ).intensities
-        response = done.mean(axis=-1, dtype=np.float64)
+        valid = np.zeros(picture.shape, bool)
+        developed = demosaic(picture, valid, pattern, mode=way, interpolation="bilinear", colored=False)
+        response = developed.intensities.mean(axis=-1, dtype=np.float64)
         if mode == "half":
             response = response.reshape(len(ANGLES), side // 2, 2, side // 2, 2).mean(axis=(2, 4))
-        # Impulses of one position lie so far apart that no pixel sees two.
+        # Impulses of one position are too far apart to overlap.
         squares += response**2
-        summed += response[:, inner, inner].sum(axis=(1, 2)) ** 2  # by the only impulse in there
+        summed += response[:, inner, inner].sum(axis=(1, 2)) ** 2  # of one impulse
     variances = squares[:, inner, inner]
     blocks = variances.reshape(4, variances.shape[1] // period, period, variances.shape[2] // period, period)
     mean = float(summed.mean()) * step**2 / cell**2
@@ -271,13 +271,14 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True, eq=False)
 class Developed:
-    """Intensities of a shot before anything is derived from them.
+    """Developed intensities of a shot.
 
     Attributes:
         intensities: [4, H, W, C] float32, linear; noise about black may be negative.
-        dark, saturated, masked: [H, W].
-        noise: noise of a sample. factors: variance of an intensity (of the luminance) as a multiple of a sample's,
-            [4, p, p] over a period of pixels.
+        dark, saturated, masked: masks [H, W].
+        noise: noise of a sample.
+        factors: variance of an intensity (of the luminance) as a multiple of the variance of a sample, [4, p, p] over a
+            period of pixels.
         mean_variance, pair_ratio, notes, origin, whole: as in ``ShotMaps``.
     """
 
@@ -295,4 +296,4 @@ class Developed:
 
 
 Part = tuple[int, int, int, int]
-"""Column and row at which a part of a picture begins, its width and height."""
+"""Column, row, width and height of a part of a picture."""

@@ -1,4 +1,4 @@
-"""From the files of a set to the samples that are fitted: linear values of its pictures, their angles and exposures."""
+"""Samples of a set for the fit: linear values of its pictures, their angles and exposures."""
 
 from __future__ import annotations
 
@@ -26,30 +26,36 @@ from polarguide.capture.layout import require_memory
 from polarguide.capture.picture_sets import Mask, SetSamples
 from polarguide.capture.view import FULL_CODE, View
 from polarguide.capture.view_reader import ViewData, require_alike
-from polarguide.core.errors import PolarguideError
+from polarguide.core.errors import require
 from polarguide_shots.options import ShotOptions
-from polarguide_shots.sets import SetPicture, known_places, read_frames
+from polarguide_shots.sets import SetPicture, known_indices, read_frames
 
-# Compression smears the edge of clipped areas over a few values.
 _COMPRESSED_FULL = 250
+"""Full scale of compressed video. Compression smears the edge of clipped areas over a few values."""
 _FITTED = 4 * (4 * 3 + 3 + 7)
-"""Bytes for each pixel of what is fitted: intensities, Stokes vectors and maps."""
+"""Bytes per pixel of the fit: intensities, Stokes vectors and maps."""
 
 
 def read_set(name: str, pictures: Sequence[SetPicture], options: ShotOptions) -> SetSamples:
     """Read the pictures of a set, one after the other.
 
+    Args:
+        name: name of the shot.
+        pictures: pictures of the set.
+        options: options of the shot.
+
     Raises:
-        PolarguideError: one cannot be read, they differ in size, depth or orientation, or they do not fit into memory.
+        PolarguideError: a picture cannot be read, the pictures differ in size, depth or orientation, or memory is too
+            small.
     """
     require_no_order(options.calibration, name)
     known = [picture for picture in pictures if not isinstance(picture.angle, str)]
     kinds = ((kind_of_file(p.path) if p.frame is None else VIDEO, p.path) for p in known)
     require_one(known[0].path.parent, kinds, "a set of one kind of file", COMPARABLE)
-    read = _gathered(name, known[0].path, len(known), _read_each(known))
+    stack = _stack(name, known[0].path, len(known), _read_each(known))
     gains, notes = _gains(known)
     files = list(dict.fromkeys(picture.path for picture in known))
-    return _samples(read, pictures, gains, notes, files, options)
+    return _samples(stack, pictures, gains, notes, files, options)
 
 
 def samples_of_arrays(
@@ -66,18 +72,24 @@ def samples_of_arrays(
     require_no_order(options.calibration, name)
     pictures = [SetPicture(Path(f"picture {k + 1}"), angle) for k, angle in enumerate(angles)]
     places = [k for k, angle in enumerate(angles) if not isinstance(angle, str)]
-    read = _gathered(name, Path(name), len(places), (stacked(stored[k : k + 1]) for k in places))
-    return _samples(read, pictures, [1.0] * len(places), [], [], options)
+    stack = _stack(name, Path(name), len(places), (stacked(stored[k : k + 1]) for k in places))
+    return _samples(stack, pictures, [1.0] * len(places), [], [], options)
 
 
-def _gathered(name: str, where: Path, count: int, pictures: Iterator[Shots]) -> tuple[Shots, np.dtype[Any]]:
-    """Pictures as one array of uint16, of one channel where all are gray; and the type that they were stored in.
+def _stack(name: str, where: Path, count: int, pictures: Iterator[Shots]) -> tuple[Shots, np.dtype[Any]]:
+    """Stack pictures to one array of uint16, with one channel if all pictures are gray.
 
     Args:
-        name: of the set. where: for messages. count: how many pictures there are. pictures: one at a time.
+        name: name of the set.
+        where: path for messages.
+        count: number of pictures.
+        pictures: iterator of the pictures.
+
+    Returns:
+        The stack, and the stored type of the pictures.
 
     Raises:
-        PolarguideError: the pictures and what is fitted to them do not fit into memory.
+        PolarguideError: memory is too small for the pictures and their fit.
     """
     first = next(pictures)
     colors = 1 if _is_gray(first) else 3
@@ -101,48 +113,45 @@ def _is_gray(shot: Shots) -> bool:
 
 
 def _samples(
-    gathered: tuple[Shots, np.dtype[Any]],
+    stack: tuple[Shots, np.dtype[Any]],
     pictures: Sequence[SetPicture],
     gains: Sequence[float],
     notes: Sequence[str],
     files: Sequence[Path],
     options: ShotOptions,
 ) -> SetSamples:
-    """Return linear samples, upright, of stored ones, whose arrays are used up.
+    """Linearize stored samples in place, and rotate them upright.
 
     Args:
-        gathered: result of ``_gathered``.
-        pictures: pictures of the set, also those without a known angle.
+        stack: result of ``_stack``.
+        pictures: pictures of the set, including pictures at unknown angles.
         gains: exposures of the pictures at known angles.
         notes: notes for the user on the exposures.
         files: files of the pictures at known angles; empty for pictures in memory.
         options: options of the shot.
     """
-    read, kind = gathered
+    read, kind = stack
     known = [picture for picture in pictures if not isinstance(picture.angle, str)]
     angles = [float(picture.angle) for picture in known]
     code = read.orientation
     container = 8 * kind.itemsize
-    bits = options.bits or container
-    measured, level_notes = levels_of_shot(read.pictures, container, options, bits=bits)
-    levels = None if measured.is_full(container) else measured
-    every = np.arange(np.iinfo(kind).max + 1, dtype=kind)
+    levels, level_notes = levels_of_shot(read.pictures, container, options, bits=options.bits or container)
+    full = levels.is_full(container)
+    codes = np.arange(np.iinfo(kind).max + 1, dtype=kind)
     step = 1 / float(np.iinfo(kind).max)
-    if levels is not None:
-        every = rescaled(every, levels.white)
+    if not full:
+        codes = rescaled(codes, levels.white)
         step = 1 / levels.white
     film = files[0] if known[0].frame is not None else None
     decision = transfer_of_pictures(
-        files, options.transfer, lambda: [(_judged(read, every), angles)], video=film
+        files, options.transfer, lambda: [(_subset(read, codes), angles)], video=film
     )
-    linear = linear_codes(every, decision.transfer)
-    as_stored = levels is None and kind == np.uint16 and decision.transfer == "linear"
+    linear = linear_codes(codes, decision.transfer)
     # One picture at a time limits memory.
     for picture, clipped in zip(read.pictures, read.clipped, strict=True):
-        if levels is not None:
+        if not full:
             clipped |= (picture >= levels.saturation).any(axis=2)
-        if not as_stored:
-            picture[...] = linear[picture]
+        picture[...] = linear[picture]
     turn = orientation_calibration(code)
     dark = apply_orientation(read.dark, code)
     return SetSamples(
@@ -163,35 +172,33 @@ def _samples(
     )
 
 
-def _judged(read: Shots, every: NDArray[Any]) -> Shots:
-    """A sample of pictures with full scale that of the type of ``every``, which has what each stored value becomes."""
-    usable = ~(read.clipped.any(axis=0) | read.dark)
-    pictures = checks.sampled(read.pictures)
-    sample = checks.sampled(usable[None])
-    return Shots(every[pictures], 1, ~sample, np.zeros(sample.shape[1:], bool))
+def _subset(read: Shots, codes: NDArray[Any]) -> Shots:
+    """Return some pixels of the pictures, with ``codes`` in place of the stored values."""
+    usable = checks.sampled(~(read.clipped.any(axis=0) | read.dark)[None])
+    return Shots(codes[checks.sampled(read.pictures)], 1, ~usable, np.zeros(usable.shape[1:], bool))
 
 
 def require_no_order(calibration: Calibration, name: str) -> None:
-    """Refuse what a calibration says of pictures called 0, 45, 90 and 135 for pictures at other angles.
+    """Check that a calibration has neither gains nor an order, which apply to 0, 45, 90 and 135 degrees only.
 
     Raises:
-        PolarguideError: the calibration has gains or another order.
+        PolarguideError: the calibration has gains or an order.
     """
     for field, given in (("gains", calibration.gains is not None), ("order", calibration.order != ANGLES)):
-        if given:
-            raise PolarguideError(
-                f"calibration ({field})",
-                expected="pictures at 0, 45, 90 and 135 degrees: the option is for these",
-                found=f"{name}, a set of pictures at other angles",
-                remedy="Leave it out; sense and zero apply, and angles.csv has a column gain.",
-            )
+        require(
+            not given,
+            f"calibration ({field})",
+            expected="pictures at 0, 45, 90 and 135 degrees, which the option applies to",
+            found=f"{name}, a set of pictures at other angles",
+            remedy="Leave it out; sense and zero apply, and angles.csv has a column gain.",
+        )
 
 
 def _read_each(pictures: Sequence[SetPicture]) -> Iterator[Shots]:
-    """Each picture as read; all of one size, depth and orientation.
+    """Read pictures of one size, depth and orientation.
 
     Raises:
-        PolarguideError: one cannot be read, or differs.
+        PolarguideError: a picture cannot be read, or differs from the first one.
     """
     first: Shots | None = None
     for path, group in itertools.groupby(pictures, key=lambda picture: picture.path):
@@ -199,20 +206,20 @@ def _read_each(pictures: Sequence[SetPicture]) -> Iterator[Shots]:
         for shot in _video(path, frames) if frames[0] is not None else [read_stack([path])] * len(frames):
             first = first or shot
             require_alike(path, shot.pictures[0], pictures[0].path, first.pictures[0])
-            if shot.orientation != first.orientation:
-                raise PolarguideError(
-                    path,
-                    expected=f"EXIF orientation {first.orientation} like {pictures[0].path.name}",
-                    found=str(shot.orientation),
-                    remedy="Keep the camera still within a set, or export all with the same orientation.",
-                )
+            require(
+                shot.orientation == first.orientation,
+                path,
+                expected=f"EXIF orientation {first.orientation} like {pictures[0].path.name}",
+                found=str(shot.orientation),
+                remedy="Keep the camera still within a set, or export all with the same orientation.",
+            )
             yield shot
 
 
 def _video(path: Path, frames: Sequence[int | None]) -> Iterator[Shots]:
-    """Frames of a video, in the order that is asked for, as pictures are read."""
-    rising = sorted(frame for frame in frames if frame is not None)
-    read = dict(zip(rising, read_frames(path, rising), strict=True))
+    """Read frames of a video in the requested order."""
+    ordered = sorted(frame for frame in frames if frame is not None)
+    read = dict(zip(ordered, read_frames(path, ordered), strict=True))
     for frame in frames:
         picture = read[frame or 0]
         clipped = np.asarray((picture >= _COMPRESSED_FULL).any(axis=2))
@@ -220,7 +227,7 @@ def _video(path: Path, frames: Sequence[int | None]) -> Iterator[Shots]:
 
 
 def _gains(pictures: Sequence[SetPicture]) -> tuple[list[float], list[str]]:
-    """The gain of each picture: as the table states, else as the files state their exposure; and notes."""
+    """Return the gain of each picture, from the table or else from the exposures in the files, and notes."""
     gains = [picture.gain for picture in pictures]
     if all(gain is None and picture.frame is None for gain, picture in zip(gains, pictures, strict=True)):
         return stated_of_shot([picture.path for picture in pictures])
@@ -228,13 +235,18 @@ def _gains(pictures: Sequence[SetPicture]) -> tuple[list[float], list[str]]:
 
 
 def samples_of_view(data: ViewData, full: int | None, options: ShotOptions) -> SetSamples:
-    """The samples of a view of a scene as stored, at other angles than the usual four; ``full``: where it saturates.
+    """Return the samples of a view of a scene folder at other angles than the usual four.
+
+    Args:
+        data: the view.
+        full: stored value at which it saturates, or None.
+        options: options of the shot.
 
     Raises:
-        PolarguideError: its known pictures do not determine Stokes vectors.
+        PolarguideError: the pictures at known angles do not determine Stokes vectors.
     """
     require_no_order(options.calibration, data.name)
-    places = known_places(data.name, data.exposures)
+    places = known_indices(data.name, data.exposures)
     saturated = np.zeros(data.black.shape, bool) if full is None else np.asarray(data.peak >= full)
     return SetSamples(
         labels=tuple(f"picture {k + 1}" for k in places),
@@ -252,33 +264,33 @@ def samples_of_view(data: ViewData, full: int | None, options: ShotOptions) -> S
 
 
 def behind_lens(view: View, intensities: Tensor, exposures: Sequence[Exposure]) -> Tensor:
-    """Intensities of a view [K, H, W, C] at some exposures, as polarizers behind the lens would have measured them."""
+    """Convert intensities of a view [K, H, W, C] to those of polarizers behind the lens."""
     if view.mount == "sensor":
         return intensities
     rays = view.camera.rays()
-    more = analyzers(exposures, rays, "sensor")[..., None, None] - analyzers(exposures, rays, "filter")
-    return intensities + torch.einsum("ksyx,syxc->kyxc", more, view.stokes()[1:]) / 2
+    change = analyzers(exposures, rays, "sensor")[..., None, None] - analyzers(exposures, rays, "filter")
+    return intensities + torch.einsum("ksyx,syxc->kyxc", change, view.stokes()[1:]) / 2
 
 
 def state_of(view: View) -> tuple[Mask, Mask, float]:
-    """Dark and saturated pixels of a view, and one stored value as a share of full scale."""
+    """Return masks of dark and saturated pixels of a view, and one stored value as a share of full scale."""
     codes = view.codes.numpy()
     peak = codes.max(axis=(0, 3))
     lost = view.saturated.numpy()
-    # Of pixels without polarization information, those nearer to black than to the brightest of the view are dark.
+    # Pixels without polarization information are dark below half of the view's maximum, else saturated.
     dark = (lost & (peak < peak.max() / 2)) | (peak == 0)
-    # Codes are multiples of what one stored value is, unless they were decoded or averaged.
+    # Codes are multiples of one stored value unless they were decoded or averaged.
     step = int(np.gcd.reduce(np.flatnonzero(np.bincount(codes.ravel()))))
     return dark, lost & ~dark, max(step, 1) / FULL_CODE
 
 
 def samples_of_loaded(view: View) -> SetSamples:
-    """The samples of a view as loaded: with its mask, its exposures, and rays through a filter before the lens.
+    """Return the samples of a loaded view, with its mask and exposures, corrected for a filter before the lens.
 
     Raises:
-        PolarguideError: its known pictures do not determine Stokes vectors.
+        PolarguideError: the pictures at known angles do not determine Stokes vectors.
     """
-    places = known_places(view.name, view.exposures)
+    places = known_indices(view.name, view.exposures)
     dark, saturated, step = state_of(view)
     exposures = [replace(view.exposures[k], gain=1.0) for k in places]
     intensities = behind_lens(view, view.intensities()[places], exposures)
@@ -296,12 +308,12 @@ def samples_of_loaded(view: View) -> SetSamples:
 
 
 def _unused(count: int) -> tuple[str, ...]:
-    """The note about pictures that a fit cannot use."""
+    """Return a note on the number of pictures at unknown angles."""
     return (f"{count} pictures without a known angle are not used.",) if count else ()
 
 
 def stated_of_shot(paths: Sequence[Path]) -> tuple[list[float], list[str]]:
-    """The relative exposures that the files of a single shot state, else ones; and notes for the user."""
+    """Return the relative exposures that the files of a shot state, else ones, and notes for the user."""
     stated, missing = stated_exposures({"": paths})
     if not stated:
         return [1.0] * len(paths), [missing] if missing else []

@@ -1,4 +1,4 @@
-"""Find sets of pictures at any polarizer angles: by names, folders, a table, or frames of a video."""
+"""Exposure sets, and the search for sets at any polarizer angles by names, folders, a table, or frames of a video."""
 
 from __future__ import annotations
 
@@ -18,7 +18,6 @@ from polarguide.capture.exposures import (
     WELL_CONDITIONED,
     Angle,
     Exposure,
-    Line,
     angle_text,
     angles_of_names,
     conditioning,
@@ -38,7 +37,7 @@ from polarguide.capture.filter.shots import (
 )
 from polarguide.capture.layout import ambiguous, list_files
 from polarguide.capture.view import ANGLES, listed
-from polarguide.core.errors import PolarguideError
+from polarguide.core.errors import PolarguideError, require
 from polarguide.core.files import read_rows, require_file
 from polarguide.core.records import shortened
 from polarguide.core.text import canonical, stem_of, whole_number
@@ -47,13 +46,14 @@ from polarguide_shots.options import Kind
 
 @dataclass(frozen=True)
 class SetPicture:
-    """One picture of a set.
+    """A picture of a set.
 
     Attributes:
         path: path of the picture, or of the video.
-        angle: of the polarizer as the user counts it, degrees; "unknown", or "none" without a polarizer: not used.
-        gain: exposure relative to the others, where a table states it.
-        frame: frame of the video, from 0; None for a picture file.
+        angle: angle of the polarizer in degrees as the user counts it; "unknown", or "none" without a polarizer. Only
+            pictures at known angles are used.
+        gain: exposure relative to the other pictures if a table states it, else None.
+        frame: frame of the video, counted from 0; None for a picture file.
     """
 
     path: Path
@@ -63,28 +63,28 @@ class SetPicture:
 
     @property
     def label(self) -> str:
-        """Its name in messages."""
+        """Name in messages."""
         return self.path.name if self.frame is None else f"{self.path.name} frame {self.frame}"
 
 
 @dataclass(frozen=True)
 class ExposureSet:
-    """The files of one shot.
+    """The files of one shot, or its pictures in memory.
 
     Attributes:
-        name: unique among the sets that were found together; usable in a file name.
-        kind: mosaic (one file), filter (one file at 0, 45, 90 and 135 degrees each), set (pictures at any angles) or
+        name: name that is unique among the sets of one search and valid in a file name.
+        kind: mosaic (one file), filter (one file each at 0, 45, 90 and 135 degrees), set (pictures at any angles) or
             scene (a view of a scene folder).
-        files: by angle; a mosaic's under 0, none of a set. Angles may be missing: ``read_shot`` says so.
-        root: folder of the scene; else None.
-        view: its name in the scene.
-        fault: why it is no shot: ``read_shot`` raises it, and the shots beside it are not concerned.
-        others: where there is a fault, files that ``files`` has no place for; or the folder that it is in. Of a view of
-            a scene, its pictures where they are not the usual four.
+        files: files by angle; the file of a mosaic at 0; empty for a set. ``read_shot`` reports missing angles.
+        root: folder of the scene, else None.
+        view: name of the view in the scene.
+        fault: error of an invalid shot, which ``read_shot`` raises. Other shots of the search are not affected.
+        others: files of an invalid shot that are not in ``files``, or its folder; the pictures of a view of a scene at
+            other angles than the usual four.
         pictures: pictures of a set, by angle.
-        table: that states their angles; None where names do.
-        stored: the pictures of a shot in memory, which has no files: [H, W] of a mosaic, else [K, H, W, 3].
-        angles: theirs, as the user counts them; none of a mosaic.
+        table: table with their angles; None if names state the angles.
+        stored: pictures of a shot in memory: [H, W] of a mosaic, else [K, H, W, 3].
+        angles: angles of the pictures in memory, as the user counts them; empty for a mosaic.
     """
 
     name: str
@@ -101,56 +101,56 @@ class ExposureSet:
 
     @property
     def paths(self) -> tuple[Path, ...]:
-        """The files, by angle, and the table of a set; at least one, or none of a shot in memory."""
-        of_set = dict.fromkeys(picture.path for picture in self.pictures)
-        more = [] if self.table is None else [self.table]
-        return (*(path for _, path in sorted(self.files.items())), *of_set, *more, *self.others)
+        """Files by angle and the table of a set; empty for a shot in memory."""
+        pictures = dict.fromkeys(picture.path for picture in self.pictures)
+        table = [] if self.table is None else [self.table]
+        return (*(path for _, path in sorted(self.files.items())), *pictures, *table, *self.others)
 
     @property
     def where(self) -> Path | str:
-        """Its name in messages: its first file, or its name."""
+        """The first file, or the name, for messages."""
         return self.paths[0] if self.paths else self.name
 
     @property
-    def whole(self) -> bool:
-        """Whether no more pictures of a set are expected: a table lists them, or they cover half a turn evenly."""
+    def complete(self) -> bool:
+        """True if a table lists the pictures of a set, or they cover half a turn evenly."""
         angles = [picture.angle for picture in self.pictures if not isinstance(picture.angle, str)]
         return self.table is not None or covers_turn([angle % 180 for angle in angles])
 
     @property
-    def nothing(self) -> bool:
-        """Whether there is no shot, but only a fault."""
+    def empty(self) -> bool:
+        """True for a fault without a shot."""
         return self.fault is not None and not (self.files or self.pictures)
 
 
 def require_determined(where: object, angles: Sequence[Angle]) -> None:
-    """Refuse angles that do not determine a Stokes vector, or hardly.
+    """Check that angles determine a Stokes vector well.
 
     Raises:
-        PolarguideError: fewer than three known angles differ modulo 180 degrees, or all are too much alike.
+        PolarguideError: fewer than three known angles differ modulo 180 degrees, or all are too similar.
     """
-    words = listed([angle_text(angle) for angle in angles], 12)
+    texts = listed([angle_text(angle) for angle in angles], 12)
     exposures = [Exposure(normalized(angle)) for angle in angles if not isinstance(angle, str)]
     different = len({round(e.angle or 0.0, 6) % 180 for e in exposures})
-    if different < FEWEST:
-        raise PolarguideError(
-            where,
-            expected="pictures at three or more different angles (modulo 180 degrees)",
-            found=f"{different} ({words})",
-            remedy="Add pictures: 0, 60 and 120 degrees are enough.",
-        )
+    require(
+        different >= FEWEST,
+        where,
+        expected="pictures at three or more different angles (modulo 180 degrees)",
+        found=f"{different} ({texts})",
+        remedy="Add pictures: 0, 60 and 120 degrees are enough.",
+    )
     condition = conditioning(nominal(exposures))
-    if condition < WELL_CONDITIONED:
-        raise PolarguideError(
-            where,
-            expected=f"angles spread over half a turn, with a conditioning of {WELL_CONDITIONED:g} or more",
-            found=f"{condition:.2g} ({words})",
-            remedy="Turn the polarizer further: 0, 60 and 120 degrees have 0.71.",
-        )
+    require(
+        condition >= WELL_CONDITIONED,
+        where,
+        expected=f"angles spread over half a turn, with a conditioning of {WELL_CONDITIONED:g} or more",
+        found=f"{condition:.2g} ({texts})",
+        remedy="Turn the polarizer further: 0, 60 and 120 degrees have 0.71.",
+    )
 
 
-def known_places(view: str, exposures: Sequence[Exposure]) -> list[int]:
-    """The places of the pictures of a view at known angles.
+def known_indices(view: str, exposures: Sequence[Exposure]) -> list[int]:
+    """Return the indices of the pictures of a view at known angles.
 
     Raises:
         PolarguideError: the angles do not determine Stokes vectors.
@@ -159,7 +159,7 @@ def known_places(view: str, exposures: Sequence[Exposure]) -> list[int]:
         e.angle if e.angle is not None else "unknown" if e.filtered else "none" for e in exposures
     ]
     require_determined(f"view {view}", angles)
-    return [place for place, angle in enumerate(angles) if not isinstance(angle, str)]
+    return [index for index, angle in enumerate(angles) if not isinstance(angle, str)]
 
 
 def _exposure_set(
@@ -168,26 +168,29 @@ def _exposure_set(
     table: Path | None = None,
     fault: PolarguideError | None = None,
 ) -> ExposureSet:
-    """A set with its pictures in order, and its fault if its angles determine nothing.
+    """Create a set with its pictures in order, and with a fault if its angles do not determine Stokes vectors.
 
-    One picture each at 0, 45, 90 and 135 degrees, without gains, are a shot of four.
+    One picture each at 0, 45, 90 and 135 degrees, without gains, are a shot of kind "filter".
     """
-    mine = tuple(sorted(pictures, key=lambda p: (*angle_order(p.angle), p.path.name, p.frame or 0)))
+    ordered = tuple(sorted(pictures, key=lambda p: (*angle_order(p.angle), p.path.name, p.frame or 0)))
     if fault is None:
         try:
-            require_determined(f"{(table or mine[0].path.parent)} ({name})", [p.angle for p in mine])
+            require_determined(f"{(table or ordered[0].path.parent)} ({name})", [p.angle for p in ordered])
         except PolarguideError as error:
             fault = error
-    four = {int(p.angle): p.path for p in mine if p.angle in ANGLES and p.gain is None and p.frame is None}
-    if fault is None and len(four) == len(mine) == len(ANGLES):
+    four = {int(p.angle): p.path for p in ordered if p.angle in ANGLES and p.gain is None and p.frame is None}
+    if fault is None and len(four) == len(ordered) == len(ANGLES):
         return ExposureSet(name, "filter", four, table=table)
-    return ExposureSet(name, "set", {}, fault=fault, pictures=mine, table=table)
+    return ExposureSet(name, "set", {}, fault=fault, pictures=ordered, table=table)
 
 
 def by_name(files: Sequence[Path]) -> tuple[list[ExposureSet], list[Path]]:
-    """Sets by the names of files, and the files that belong to no set: of four angles at most, or without an angle.
+    """Find sets by the names of files.
 
-    Files named like angles alone are one set, called like their folder, where there is nothing else among the files.
+    Files whose names are angles only are one set with the name of their folder if the folder has no other files.
+
+    Returns:
+        The sets, and the remaining files: files of four angles at most, and files without an angle in the name.
     """
     sets: list[ExposureSet] = []
     rest: list[Path] = []
@@ -199,30 +202,30 @@ def by_name(files: Sequence[Path]) -> tuple[list[ExposureSet], list[Path]]:
                 rest.append(path)
             else:
                 views.setdefault(name[0], []).append(SetPicture(path, name[1]))
-        for view, mine in sorted(views.items()):
-            paths = [picture.path for picture in mine]
-            four = all(picture.angle in ANGLES for picture in mine)
-            # Names with a mark such as cup_a45 are known here alone.
-            if four and not (len(mine) == 4 and group_files(paths)[1]):
+        for view, pictures in sorted(views.items()):
+            paths = [picture.path for picture in pictures]
+            four = all(picture.angle in ANGLES for picture in pictures)
+            # Only this function knows names with a mark such as cup_a45.
+            if four and not (len(paths) == 4 and group_files(paths)[1]):
                 rest += paths
             else:
-                sets.append(_named_set(folder, view, mine))
+                sets.append(_named_set(folder, view, pictures))
     return sets, rest
 
 
 def by_folder(root: Path) -> list[ExposureSet]:
-    """Sets by folders named like angles, a file of each view in each; nothing where these are four at most."""
+    """Find sets by folders named like angles, with a file of each view; empty for four angles at most."""
     views: dict[str, list[SetPicture]] = {}
     for folder, angle in folders_of_angles(root).items():
         for path in list_files(folder, SHOT_SUFFIXES):
             views.setdefault(stem_of(path), []).append(SetPicture(path, angle))
-    if all(picture.angle in ANGLES for mine in views.values() for picture in mine):
+    if all(picture.angle in ANGLES for pictures in views.values() for picture in pictures):
         return []
-    return [_named_set(root, view, mine) for view, mine in sorted(views.items())]
+    return [_named_set(root, view, pictures) for view, pictures in sorted(views.items())]
 
 
 def _named_set(folder: Path, view: str, pictures: Sequence[SetPicture]) -> ExposureSet:
-    """A set by names: two files that state the same number are one picture too many."""
+    """Create a set whose names state the angles. Two files with one angle are a fault."""
     first: dict[Angle, Path] = {}
     for picture in pictures:
         earlier = first.setdefault(picture.angle, picture.path)
@@ -233,56 +236,52 @@ def _named_set(folder: Path, view: str, pictures: Sequence[SetPicture]) -> Expos
 
 
 def by_table(root: Path) -> tuple[list[ExposureSet], list[Path]]:
-    """Sets that the table ``angles.csv`` of a folder lists, and the pictures of the folder that it does not list.
+    """Read the sets in the table ``angles.csv`` of a folder.
 
-    Lines with one view are a set. Lines without a view are sets by the names of their files where all of these state a
-    view, else one set called like the folder. Doubles are taken as they are.
+    Lines with one view are a set. Lines without a view are sets by the names of their files if all of these names
+    contain a view, else one set with the name of the folder. Repeated angles are valid.
+
+    Returns:
+        The sets, and the pictures of the folder that are not in the table.
 
     Raises:
-        PolarguideError: the table cannot be read, or names files outside of the folder or of other kinds.
+        PolarguideError: the table cannot be read, or lists files outside of the folder or of other types.
     """
     table = root / TABLE
     rows, others = listed_pictures(root, table)
-    lines = [line for line, _ in rows]
-    views: dict[str, list[SetPicture]] = {}
-    for (line, path), view in zip(rows, _views_of(root, lines), strict=True):
-        views.setdefault(view, []).append(SetPicture(path, line.angle, line.gain))
-    return [_of_table(table, view, mine) for view, mine in sorted(views.items())], others
-
-
-def _views_of(root: Path, lines: Sequence[Line]) -> list[str]:
-    """The view of each line."""
-    without = [line for line in lines if line.view is None]
-    named = angles_of_names([stem_of(Path(line.file)) for line in without])
-    all_named = all(name is not None and name[0] for name in named)
-    of_file = {
-        line.file: name[0] if all_named and name is not None else canonical(root.resolve().name)
-        for line, name in zip(without, named, strict=True)
+    unnamed = [line.file for line, _ in rows if line.view is None]
+    names = angles_of_names([stem_of(Path(file)) for file in unnamed])
+    all_named = all(name is not None and name[0] for name in names)
+    view_of = {
+        file: name[0] if all_named and name is not None else canonical(root.resolve().name)
+        for file, name in zip(unnamed, names, strict=True)
     }
-    return [of_file[line.file] if line.view is None else line.view for line in lines]
+    views: dict[str, list[SetPicture]] = {}
+    for line, path in rows:
+        view = view_of[line.file] if line.view is None else line.view
+        views.setdefault(view, []).append(SetPicture(path, line.angle, line.gain))
+    return [_table_set(table, view, pictures) for view, pictures in sorted(views.items())], others
 
 
-def _of_table(table: Path, view: str, pictures: Sequence[SetPicture]) -> ExposureSet:
-    """Return the set of a view's pictures; a missing file is its fault."""
-    there = [picture for picture in pictures if picture.path.is_file()]
-    missing = next((picture.path for picture in pictures if not picture.path.is_file()), None)
-    if missing is None:
-        return _exposure_set(view, there, table)
+def _table_set(table: Path, view: str, pictures: Sequence[SetPicture]) -> ExposureSet:
+    """Create the set of a view's pictures. A missing file is a fault."""
+    existing = [picture for picture in pictures if picture.path.is_file()]
+    missing = [picture.path for picture in pictures if picture not in existing]
+    if not missing:
+        return _exposure_set(view, existing, table)
     fault = PolarguideError(
         table,
-        expected=f"the file {missing}",
+        expected=f"the file {missing[0]}",
         found="nothing of this name",
         remedy="Correct the file's name in the table, or remove its line.",
     )
-    return _exposure_set(view, there, table, fault)
+    return _exposure_set(view, existing, table, fault)
 
 
 def videos(files: Sequence[Path]) -> list[ExposureSet]:
-    """Each video as a set, with the frames that the table beside it lists."""
+    """Create a set of each video among files, with the frames in the table next to it."""
     sets = []
-    for path in files:
-        if path.suffix.lower() not in VIDEO_SUFFIXES:
-            continue
+    for path in (path for path in files if path.suffix.lower() in VIDEO_SUFFIXES):
         table = path.with_suffix(".csv")
         try:
             frames = read_frame_table(table, path)
@@ -294,35 +293,37 @@ def videos(files: Sequence[Path]) -> list[ExposureSet]:
     return sets
 
 
-_COLUMNS = ["frame", "angle"]
 _REMEDY = "Write a line for each frame to use: its number, counted from 0, and its angle in degrees."
 
 
 def read_frame_table(path: Path, video: Path) -> list[tuple[int, Angle]]:
-    """The lines of a table ``frame,angle``: frames counted from 0, and their angles.
+    """Read a table ``frame,angle`` of a video.
+
+    Returns:
+        Frames, counted from 0, and their angles.
 
     Raises:
-        PolarguideError: there is no such table, a cell is wrong, or a frame is listed twice.
+        PolarguideError: the table is missing, a cell is invalid, or a frame is repeated.
     """
-    if not path.is_file():
-        raise PolarguideError(
-            path, expected=f"a table frame,angle of {video.name}", found="no such file", remedy=_REMEDY
-        )
+    table = f"a table frame,angle of {video.name}"
+    require(path.is_file(), path, expected=table, found="no such file", remedy=_REMEDY)
     rows = read_rows(path, _REMEDY)
-    header = [cell.lower() for cell in rows[0][1]] if rows else []
-    if header != _COLUMNS:
-        found = shortened(",".join(header)) or "an empty file"
-        raise PolarguideError(
-            f"{path} (line 1)", expected="the header frame,angle", found=found, remedy=_REMEDY
-        )
+    header = ",".join(rows[0][1]).lower() if rows else ""
+    require(
+        header == "frame,angle",
+        f"{path} (line 1)",
+        expected="the header frame,angle",
+        found=shortened(header) if header else "an empty file",
+        remedy=_REMEDY,
+    )
     frames: dict[int, Angle] = {}
     for number, row in rows[1:]:
-        angle = parse_angle(row[1]) if len(row) == len(_COLUMNS) else None
+        angle = parse_angle(row[1]) if len(row) == 2 else None
         frame = whole_number(row[0])
         if angle is None or frame is None or frame in frames:
             raise PolarguideError(
                 f"{path} (line {number})",
-                expected=f"a frame that no other line has, and its angle up to {LARGEST:g} degrees",
+                expected=f"a frame that is not in another line, and its angle up to {LARGEST:g} degrees",
                 found=shortened(",".join(row)),
                 remedy=_REMEDY,
             )
@@ -331,14 +332,16 @@ def read_frame_table(path: Path, video: Path) -> list[tuple[int, Angle]]:
 
 
 def read_frames(path: Path, frames: Sequence[int]) -> Iterator[NDArray[np.uint8]]:
-    """The frames of a video [H, W, 3] uint8 RGB, one after the other.
+    """Read frames of a video [H, W, 3] uint8 RGB, one after the other.
+
+    Frames keep their stored orientation: angles count from their horizontal.
 
     Args:
-        path: of the video, whose frames stay as they are stored: angles count from their horizontal. frames: numbers,
-            counted from 0 and rising.
+        path: path of the video.
+        frames: numbers of the frames, counted from 0, in ascending order.
 
     Raises:
-        PolarguideError: OpenCV cannot read the video, or it ends before the last of them.
+        PolarguideError: OpenCV cannot read the video, or the video is too short.
     """
     require_file(path, expected="a video", remedy="Copy the file there.")
     video = cv2.VideoCapture(str(path))
@@ -346,12 +349,10 @@ def read_frames(path: Path, frames: Sequence[int]) -> Iterator[NDArray[np.uint8]
     try:
         place = -1
         for frame in frames:
-            # One by one: many formats seek to the nearest key frame only.
+            # Sequential reading: many formats seek to the nearest key frame only.
             while place < frame and video.grab():
                 place += 1
-            picture: Any = None
-            if place == frame:
-                _, picture = video.retrieve()
+            picture: Any = video.retrieve()[1] if place == frame else None
             if picture is None or np.ndim(picture) != 3:
                 found = f"a video of {place + 1}" if place >= 0 else "a file that OpenCV cannot read"
                 raise PolarguideError(

@@ -1,7 +1,7 @@
 """Polarized scenes with ground truth, rendered by physical light transport: the extra ``synth``.
 
-A scene file (``schema``) becomes meshes (``shapes``), textures (``textures``) and Mitsuba scenes (``build``).
-``transport`` traces polarized paths, ``film`` renders the pixels of a camera, ``geometry`` computes ground truth,
-``sparse`` simulates the COLMAP model and ``sensor`` the raw mosaics of a polarization camera; ``render`` writes the
-folder. Mitsuba is imported inside functions only, after ``variant`` has chosen one of its variants.
+``schema`` validates a scene file. ``build`` converts it to meshes (``mesh``), textures (``textures``) and Mitsuba
+scenes. ``transport`` traces polarized paths. ``sensor`` renders the pixels of a camera and simulates photographs.
+``ground_truth`` computes normals, depth and materials, and ``colmap`` simulates the COLMAP model. ``render`` writes the
+scene folder. Mitsuba is imported on first use, after ``settings.choose_variant`` has selected a variant.
 """

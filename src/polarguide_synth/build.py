@@ -1,11 +1,12 @@
-"""Build Mitsuba scenes from scene data: one for all wavelengths, or one each for red, green and blue.
+"""Mitsuba scenes from scene data: one scene for all wavelengths, or one each for red, green and blue.
 
-Procedural shapes are centered at the origin or stand on it, with z up; docs/reference/scene-files.md describes the
-fields of the types of ``shape``.
+Procedural shapes are centered at the origin or stand on it, with z up. docs/reference/scene-files.md describes the
+fields of each ``shape``.
 """
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polarguide.core.errors import PolarguideError
+from polarguide.core.errors import PolarguideError, require
 from polarguide.core.files import make_folder, write_whole
 from polarguide.core.records import decode
 from polarguide.geometry.vectors import unit_array as unit
@@ -35,56 +36,70 @@ from polarguide_synth.schema import (
 )
 from polarguide_synth.settings import Variant, mi
 from polarguide_synth.textures import fractal_noise, make_environment, make_texture
-from polarguide_synth.transport import SHOWN
+from polarguide_synth.transport import VISIBLE
 
 
 def sphere(radius: float = 1.0, detail: int = 96) -> Mesh:
-    """A ball as triangles with exact normals."""
+    """Mesh a ball, with exact normals."""
     polar = np.linspace(0, np.pi, detail // 2 + 1)
-    turned = lathe([[np.sin(a), -np.cos(a)] for a in polar], segments=detail, smooth=0)
-    return Mesh(radius * turned.points, turned.faces, turned.uv, unit(turned.points))
+    ball = lathe([[np.sin(a), -np.cos(a)] for a in polar], segments=detail, smooth=0)
+    return Mesh(radius * ball.points, ball.faces, ball.uv, unit(ball.points))
 
 
 def plane(size: tuple[float, float] = (1.0, 1.0), tile: float = 0.0) -> Mesh:
-    """A rectangle that looks up; ``tile`` is the length of one repeat of its texture, 0 for one over all."""
-    x, y = size
-    points = np.array([[-x, -y, 0], [x, -y, 0], [x, y, 0], [-x, y, 0]]) / 2
-    uv = points[:, :2] / tile if tile else np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
+    """Mesh a rectangle that faces up.
+
+    Args:
+        size: lengths along x and y.
+        tile: length of one repeat of the texture; 0: the texture covers the rectangle once.
+    """
+    corners = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
+    points = np.column_stack(((2 * corners - 1) * size, np.zeros(4))) / 2
+    uv = points[:, :2] / tile if tile else corners
     return Mesh(points, np.array([[0, 1, 2], [0, 2, 3]]), uv, np.tile([0.0, 0, 1], (4, 1)))
 
 
 def box(size: tuple[float, float, float] = (1.0, 1.0, 1.0), bevel: float = 0.0, detail: int = 4) -> Mesh:
-    """A box with rounded edges; each side shows the whole texture."""
+    """Mesh a box with rounded edges. Each side shows the whole texture.
+
+    Args:
+        size: lengths of the sides.
+        bevel: radius of the edges.
+        detail: number of facets of an edge.
+
+    Raises:
+        ValueError: the bevel is larger than half of the shortest side.
+    """
     half = np.array(size, float) / 2
     if not 0 <= bevel <= half.min():
         raise ValueError(f"a bevel of {bevel:g}, where half of the shortest side is {half.min():g}")
-    round_ = min(bevel, float(half.min()) * 0.999) or 1e-5
+    radius = min(bevel, float(half.min()) * 0.999) or 1e-5
     corner = np.tan(np.linspace(-np.pi / 4, np.pi / 4, detail + 1))
+    bent = radius * (corner[: detail // 2 + 1] + 1)
+    lines = [np.unique(np.round(np.concatenate([-h + bent, h - bent[::-1]]), 12)) for h in half]
     sides = []
-    for axis in range(3):
-        for sign in (1.0, -1.0):
-            u, v = ((axis + 1) % 3, (axis + 2) % 3) if sign > 0 else ((axis + 2) % 3, (axis + 1) % 3)
-            grids = []
-            for k in (u, v):
-                bent = round_ * (corner[: detail // 2 + 1] + 1)
-                line = np.concatenate([-half[k] + bent, half[k] - bent[::-1]])
-                grids.append(np.unique(np.round(line, 12)))
-            a, b = np.meshgrid(*grids, indexing="ij")
-            points = np.zeros((*a.shape, 3))
-            points[..., u], points[..., v], points[..., axis] = a, b, sign * half[axis]
-            core = np.clip(points, -(half - round_), half - round_)
-            normals = unit(points - core)
-            uv = np.stack((a / (2 * half[u]) + 0.5, b / (2 * half[v]) + 0.5), -1)
-            points = core + round_ * normals
-            faces = grid_faces(*a.shape)[:, [0, 2, 1]]
-            sides.append(Mesh(points.reshape(-1, 3), faces, uv.reshape(-1, 2), normals.reshape(-1, 3)))
+    for axis, sign in itertools.product(range(3), (1.0, -1.0)):
+        u, v = ((axis + 1) % 3, (axis + 2) % 3)[:: int(sign)]
+        a, b = np.meshgrid(lines[u], lines[v], indexing="ij")
+        points = np.zeros((*a.shape, 3))
+        points[..., [u, v, axis]] = np.stack(np.broadcast_arrays(a, b, sign * half[axis]), -1)
+        core = np.clip(points, -(half - radius), half - radius)
+        normals = unit(points - core)
+        uv = np.stack((a / (2 * half[u]) + 0.5, b / (2 * half[v]) + 0.5), -1)
+        sides.append(_grid_mesh(core + radius * normals, uv, normals, facing=-1))
     return joined(sides)
 
 
 def lathe(profile: list[list[float]], segments: int = 96, smooth: int = 8) -> Mesh:
-    """A profile of (radius, height), from bottom to top on the outside, turned about z.
+    """Mesh a surface of revolution about z.
 
-    ``smooth`` points are put between two points of the profile, on a Catmull-Rom curve; 0 keeps them as they are.
+    Args:
+        profile: points (radius, height), from bottom to top on the outside.
+        segments: number of segments around z.
+        smooth: number of points of a Catmull-Rom curve between two points of the profile; 0: straight lines.
+
+    Raises:
+        ValueError: the profile is invalid, or a radius is negative.
     """
     corners = _corners(profile, 2)
     if (corners[:, 0] < 0).any():
@@ -102,25 +117,25 @@ def lathe(profile: list[list[float]], segments: int = 96, smooth: int = 8) -> Me
     normals[..., 2] = -tangent[:, :1]
     along = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
     uv = np.stack(np.broadcast_arrays(angle / (2 * np.pi), (along / along[-1])[:, None]), -1)
-    faces = grid_faces(len(line), segments + 1)
-    return Mesh(points.reshape(-1, 3), faces, uv.reshape(-1, 2), normals.reshape(-1, 3))
+    return _grid_mesh(points, uv, normals)
 
 
 def tube(path: list[list[float]], radius: float = 0.1, segments: int = 24, smooth: int = 8) -> Mesh:
-    """A round bar along a path through points."""
+    """Mesh a round bar along a path through points [N, 3]; see ``lathe`` for ``segments`` and ``smooth``.
+
+    Raises:
+        ValueError: the path is invalid.
+    """
     line = _curve(_corners(path, 3), smooth)
     tangent = unit(np.gradient(line, axis=0))
     side = np.empty_like(line)
     side[0] = unit(np.cross(tangent[0], [0.3, 0.5, 0.81]))
-    for k in range(1, len(line)):  # carried along with the least turn
+    for k in range(1, len(line)):  # transport with the smallest rotation
         side[k] = unit(side[k - 1] - tangent[k] * (side[k - 1] @ tangent[k]))
-    up = np.cross(tangent, side)
     angle = np.linspace(0, 2 * np.pi, segments + 1)[:, None]
-    normals = np.cos(angle) * side[:, None] + np.sin(angle) * up[:, None]
-    points = line[:, None] + radius * normals
+    normals = np.cos(angle) * side[:, None] + np.sin(angle) * np.cross(tangent, side)[:, None]
     uv = np.stack(np.broadcast_arrays(angle[:, 0] / (2 * np.pi), np.linspace(0, 1, len(line))[:, None]), -1)
-    faces = grid_faces(len(line), segments + 1)
-    return Mesh(points.reshape(-1, 3), faces, uv.reshape(-1, 2), normals.reshape(-1, 3))
+    return _grid_mesh(line[:, None] + radius * normals, uv, normals)
 
 
 def waves(
@@ -130,28 +145,49 @@ def waves(
     length: float = 0.5,
     seed: int = 0,
 ) -> Mesh:
-    """A rectangle that looks up with smooth random waves: ``height`` from crest to trough, ``length`` apart."""
+    """Mesh a rectangle that faces up, with smooth random waves.
+
+    Args:
+        size: lengths along x and y.
+        detail: number of points along each side.
+        height: height from trough to crest.
+        length: wavelength.
+        seed: seed of the waves.
+    """
     x, y = (np.linspace(-s / 2, s / 2, detail) for s in size)
     a, b = np.meshgrid(x, y, indexing="ij")
     z = height * (fractal_noise(np.stack((a, b * 0.6), -1) / length, seed, octaves=2) - 0.5)
-    points = np.stack((a, b, z), -1)
     slope_x, slope_y = np.gradient(z, x, y)
     normals = unit(np.stack((-slope_x, -slope_y, np.ones_like(z)), -1))
     uv = np.stack((a / size[0] + 0.5, b / size[1] + 0.5), -1)
-    faces = grid_faces(detail, detail)[:, [0, 2, 1]]
-    return Mesh(points.reshape(-1, 3), faces, uv.reshape(-1, 2), normals.reshape(-1, 3))
+    return _grid_mesh(np.stack((a, b, z), -1), uv, normals, facing=-1)
 
 
 def rock(radius: float = 1.0, rough: float = 0.25, seed: int = 0, detail: int = 96) -> Mesh:
-    """A ball with random bumps of ``rough`` times its radius."""
+    """Mesh a ball with random bumps of ``rough`` times its radius."""
     ball = sphere(1.0, detail)
     bumps = fractal_noise(ball.points * 1.3 + 10, seed, octaves=4) - 0.5
     points = radius * ball.points * (1 + 2 * rough * bumps[:, None])
     return Mesh(points, ball.faces, ball.uv, smooth_normals(points, ball.faces))
 
 
+def _grid_mesh(points: Array, uv: Array, normals: Array, facing: int = 1) -> Mesh:
+    """Return the mesh of a grid: points and normals [R, C, 3], uv [R, C, 2].
+
+    Args:
+        facing: 1 if columns proceed counter-clockwise from rows as seen from outside, else -1.
+    """
+    faces = grid_faces(*points.shape[:2])
+    faces = faces if facing == 1 else faces[:, [0, 2, 1]]
+    return Mesh(points.reshape(-1, 3), faces, uv.reshape(-1, 2), normals.reshape(-1, 3))
+
+
 def _corners(points: list[list[float]], axes: int) -> Array:
-    """Two or more points of so many numbers each, as an array."""
+    """Return points as an array [N, axes].
+
+    Raises:
+        ValueError: the points are fewer than two, or have another number of coordinates.
+    """
     try:
         corners = np.array(points, float)
     except (TypeError, ValueError):
@@ -162,16 +198,18 @@ def _corners(points: list[list[float]], axes: int) -> Array:
 
 
 def _curve(points: Array, between: int) -> Array:
-    """Points on the Catmull-Rom curve through points; its ends repeat the first and last point."""
+    """Sample the Catmull-Rom curve through points, with ``between`` samples between two points.
+
+    The ends are extrapolated linearly. Fewer than three points are returned unchanged.
+    """
     if between == 0 or len(points) < 3:
         return points.copy()
     padded = np.concatenate([2 * points[:1] - points[1:2], points, 2 * points[-1:] - points[-2:-1]])
     t = (np.arange(between + 1) / (between + 1))[:, None]
-    pieces = []
-    for a, b, c, d in zip(padded, padded[1:], padded[2:], padded[3:], strict=False):
-        pieces.append(
-            0.5 * (2 * b + (c - a) * t + (2 * a - 5 * b + 4 * c - d) * t**2 + (3 * b - a - 3 * c + d) * t**3)
-        )
+    pieces = [
+        0.5 * (2 * b + (c - a) * t + (2 * a - 5 * b + 4 * c - d) * t**2 + (3 * b - a - 3 * c + d) * t**3)
+        for a, b, c, d in zip(padded, padded[1:], padded[2:], padded[3:], strict=False)
+    ]
     return np.concatenate([*pieces, points[-1:]])
 
 
@@ -182,20 +220,23 @@ SHAPES: dict[str, Callable[..., Mesh]] = {
 
 
 def make_mesh(shape: dict[str, Any], where: str) -> Mesh:
-    """The mesh that the data of a shape describe.
+    """Create the mesh of the data of a shape.
 
     Raises:
-        PolarguideError: the type or a field is unknown, or a value makes no sense.
+        PolarguideError: the type, a field or a value is invalid.
     """
     return make(SHAPES, shape, f"{where} shape", f"a type of {', '.join([*SHAPES, 'mesh'])}")
 
 
-AIR = 1.0
+def bsdf_dict(material: Material, texture: Array | None, channel: int | None) -> dict[str, Any]:
+    """Return Mitsuba's dictionary of the BSDF of a material.
 
-
-def bsdf_dict(material: Material, picture: Array | None, channel: int | None) -> dict[str, Any]:
-    """The BSDF of a material, with the texture ``picture`` [H, W, 3] if it has one."""
-    base = _value(material.color, channel) if picture is None else _bitmap(picture, channel)
+    Args:
+        material: the surface.
+        texture: base color [H, W, 3]; None: the color of the material.
+        channel: 0 to 2 for red, green or blue; None: all wavelengths.
+    """
+    base = _value(material.color, channel) if texture is None else _bitmap(texture, channel)
     if material.type == "metal":
         index = {name: _metal(getattr(material, name), channel) for name in ("eta", "k")}
         inner = {"type": "roughconductor", "distribution": "ggx", "alpha": material.roughness, **index}
@@ -203,36 +244,37 @@ def bsdf_dict(material: Material, picture: Array | None, channel: int | None) ->
         inner = {"type": "diffuse", "reflectance": base}
     else:
         inner = {"type": "pplastic", "distribution": "ggx", "alpha": material.roughness, "diffuse_reflectance": base,
-                 "int_ior": float(material.index), "ext_ior": AIR}  # fmt: skip
+                 "int_ior": float(material.index), "ext_ior": 1.0}  # fmt: skip
     return {"type": "twosided", "inner": inner}
 
 
 def _value(color: Any, channel: int | None) -> dict[str, Any]:
-    """The dictionary of a reflectance or radiance."""
+    """Return the dictionary of a reflectance or radiance."""
     if channel is None:
         return {"type": "rgb", "value": [float(c) for c in color]}
     return {"type": "uniform", "value": float(color[channel])}
 
 
 def _metal(index: tuple[float, float, float], channel: int | None) -> dict[str, Any]:
-    """The spectrum of an index that is given at red, green and blue."""
+    """Return the dictionary of a spectrum with values at red, green and blue."""
     if channel is not None:
-        return {"type": "uniform", "value": float(index[channel])}
+        return _value(index, channel)
     red, green, blue = index
     values = f"{blue}, {blue}, {green}, {red}, {red}"
     return {"type": "irregular", "wavelengths": "360, 450, 545, 620, 830", "values": values}
 
 
-def _bitmap(picture: Array, channel: int | None) -> dict[str, Any]:
-    part = picture if channel is None else picture[..., channel : channel + 1]
+def _bitmap(texture: Array, channel: int | None) -> dict[str, Any]:
+    """Return the dictionary of a texture [H, W, 3]; a texture of one row is a palette and is not interpolated."""
+    part = texture if channel is None else texture[..., channel : channel + 1]
     # Rows of a picture go down, v goes up.
-    data = np.ascontiguousarray(part[::-1], np.float32)
-    blend = "nearest" if len(data) == 1 else "bilinear"  # a palette has one row
-    return {"type": "bitmap", "bitmap": mi.Bitmap(data), "raw": channel is not None, "filter_type": blend}
+    bitmap = mi.Bitmap(np.ascontiguousarray(part[::-1], np.float32))
+    blend = "nearest" if len(texture) == 1 else "bilinear"
+    return {"type": "bitmap", "bitmap": bitmap, "raw": channel is not None, "filter_type": blend}
 
 
 def environment_dict(panorama: Array, channel: int | None) -> dict[str, Any]:
-    """The environment emitter of a panorama [H, W, 3]."""
+    """Return the dictionary of the environment emitter of a panorama [H, W, 3]."""
     part = panorama if channel is None else np.repeat(panorama[..., channel : channel + 1], 3, -1)
     # The left edge of Mitsuba's panoramas is its -z; y is up and columns proceed to the right.
     axes = np.array([[0, 0, -1, 0], [-1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]], float)
@@ -240,63 +282,74 @@ def environment_dict(panorama: Array, channel: int | None) -> dict[str, Any]:
             "to_world": mi.ScalarTransform4f(axes)}  # fmt: skip
 
 
-def shown_dict(spec: SceneSpec, visible: bool) -> dict[str, Any]:
-    """The attribute of a shape that says whether the camera sees it; nothing where it sees all."""
-    return {SHOWN: {"type": "uniform", "value": float(visible)}} if spec.object_only else {}
+def visibility_dict(spec: SceneSpec, visible: bool) -> dict[str, Any]:
+    """Return the visibility attribute of a shape; empty if the camera sees all shapes."""
+    return {VISIBLE: _value((float(visible),), 0)} if spec.object_only else {}
 
 
 def area_light_dict(light: dict[str, Any], channel: int | None, where: str) -> dict[str, Any]:
-    """A rectangular area light.
+    """Return the dictionary of a rectangular area light.
+
+    Args:
+        light: data of the light.
+        channel: see ``bsdf_dict``.
+        where: name of the scene, for messages.
 
     Raises:
-        PolarguideError: a field is missing or has another type; ``where`` names the scene.
+        PolarguideError: a field is missing or invalid.
     """
-    placed = decode(light, Light, f"{where} (lights)", remedy=REMEDY)
-    way = np.subtract(placed.toward, placed.position)
-    if not way.any():
-        raise PolarguideError(
-            f"{where} (lights)",
-            expected="two different places of each light",
-            found=str(light)[:200],
-            remedy=REMEDY,
-        )
+    lamp = decode(light, Light, f"{where} (lights)", remedy=REMEDY)
+    way = np.subtract(lamp.toward, lamp.position)
+    require(
+        way.any(),
+        f"{where} (lights)",
+        expected="a light whose position differs from its target",
+        found=str(light)[:200],
+        remedy=REMEDY,
+    )
     up = [0, 0, 1] if abs(way[2]) < 0.99 * np.linalg.norm(way) else [0, 1, 0]
-    width, height = placed.size
-    place = mi.ScalarTransform4f().look_at(list(placed.position), list(placed.toward), up)
+    width, height = lamp.size
+    place = mi.ScalarTransform4f().look_at(list(lamp.position), list(lamp.toward), up)
     place @= mi.ScalarTransform4f().scale([width / 2, height / 2, 1.0])
     return {"type": "rectangle", "to_world": place,
-            "emitter": {"type": "area", "radiance": _value(placed.radiance, channel)},
+            "emitter": {"type": "area", "radiance": _value(lamp.radiance, channel)},
             "bsdf": {"type": "diffuse", "reflectance": _value((0.0, 0.0, 0.0), channel)}}  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
 class BuiltScene:
-    """A scene ready to be rendered.
+    """A scene that Mitsuba can render.
 
     Attributes:
         spec: the scene data.
-        scenes: Mitsuba's scenes, one or three (see ``film.render_lobes``).
-        shapes: Mitsuba's shape of every object in the first scene, in the order of the data.
-        panorama: the environment, [H, W, 3].
-        textures: textures of every object, [H, W, 3] with rows from the top down, or None where it has one color.
+        scenes: Mitsuba's scenes, one or three (see ``sensor.render_lobes``).
+        shapes: Mitsuba's shapes of the objects in the first scene, in the order of the data.
+        textures: textures of the objects, [H, W, 3] with rows from the top down; None for objects of one color.
     """
 
     spec: SceneSpec
     scenes: list[Any]
     shapes: list[Any]
-    panorama: Array
     textures: list[Array | None]
 
     @property
-    def drawn(self) -> NDArray[np.bool_]:
+    def visible(self) -> NDArray[np.bool_]:
         """Visibility of the objects to the camera, by number; number 0 stands for no object."""
-        return np.array([False, *self.spec.shown])
+        return np.array([False, *self.spec.visible])
 
 
 def build_scene(spec: SceneSpec, folder: Path, variant: Variant) -> BuiltScene:
-    """Generate meshes, textures and the environment, write them to ``folder`` and load them.
+    """Generate meshes, textures and the environment of a scene, write them and load them.
 
     The files are ``mesh/<thing>.ply`` and ``environment.hdr``.
+
+    Args:
+        spec: the scene data.
+        folder: folder to write.
+        variant: the current variant of Mitsuba.
+
+    Raises:
+        PolarguideError: a shape, a texture, a light or the environment is invalid.
     """
     make_folder(folder / "mesh")
     meshes = [_mesh(thing, spec) for thing in spec.things]
@@ -306,24 +359,30 @@ def build_scene(spec: SceneSpec, folder: Path, variant: Variant) -> BuiltScene:
     require_light(panorama, f"{spec.name} (environment)")
     _, encoded = cv2.imencode(".hdr", panorama[..., ::-1].astype(np.float32))
     write_whole(folder / "environment.hdr", encoded.tobytes())
-    pictures = [_texture(thing, mesh, spec.folder) for thing, mesh in zip(spec.things, meshes, strict=True)]
-    scenes: list[Any] = []
-    shapes: list[list[Any]] = []
+    textures = [_texture(thing, mesh, spec.folder) for thing, mesh in zip(spec.things, meshes, strict=True)]
+    contents: list[dict[str, Any]] = []
     for channel in range(3) if variant.channels == 3 else (None,):
         content: dict[str, Any] = {"type": "scene", "sky": environment_dict(panorama, channel)}
         for number, thing in enumerate(spec.things):
             place = folder / "mesh" / f"{thing.name}.ply"
-            surface = {"bsdf": bsdf_dict(thing.material, pictures[number], channel)}
-            surface |= shown_dict(spec, spec.shown[number])
+            surface = {"bsdf": bsdf_dict(thing.material, textures[number], channel)}
+            surface |= visibility_dict(spec, spec.visible[number])
             content[f"thing{number}"] = _shape(thing, meshes[number], place, surface)
         for number, light in enumerate(spec.lights):
-            content[f"light{number}"] = area_light_dict(light, channel, spec.name) | shown_dict(spec, False)
-        scenes.append(mi.load_dict(content))
-        shapes.append([content[f"thing{number}"] for number in range(len(spec.things))])
-    return BuiltScene(spec, scenes, shapes[0], panorama, pictures)
+            content[f"light{number}"] = area_light_dict(light, channel, spec.name) | visibility_dict(
+                spec, False
+            )
+        contents.append(content)
+    shapes = [contents[0][f"thing{number}"] for number in range(len(spec.things))]
+    return BuiltScene(spec, [mi.load_dict(content) for content in contents], shapes, textures)
 
 
 def _mesh(thing: Thing, spec: SceneSpec) -> Mesh:
+    """Create the mesh of an object, placed in the scene.
+
+    Raises:
+        PolarguideError: the shape is invalid, or has no extent.
+    """
     if thing.shape.get("type") == "ball":
         mesh = sphere(decode(thing.shape, Ball, f"{thing.name} shape", remedy=REMEDY).radius)
     elif thing.shape.get("type") == "mesh":
@@ -337,25 +396,32 @@ def _mesh(thing: Thing, spec: SceneSpec) -> Mesh:
 
 
 def _user_mesh(path: Path) -> Mesh:
-    """The mesh in a user's PLY or OBJ file, read by Mitsuba."""
+    """Read the mesh in a user's PLY or OBJ file by Mitsuba.
+
+    Raises:
+        PolarguideError: the file is missing, damaged or of another type.
+    """
     kind = path.suffix.lower().lstrip(".")
     require_unicode(path)
-    if kind not in ("ply", "obj") or not path.is_file():
-        raise PolarguideError(
-            path,
-            expected="a mesh as .ply or .obj",
-            found="nothing" if not path.is_file() else f"a name that ends in {path.suffix or 'nothing'}",
-            remedy="File names of meshes are relative to the folder of the scene file.",
-        )
-    # flat first: Mitsuba makes normals before it compares corners with points, and writes where there are none
+    require(
+        kind in ("ply", "obj") and path.is_file(),
+        path,
+        expected="a mesh as .ply or .obj",
+        found=f"a name that ends in {path.suffix or 'nothing'}" if path.is_file() else "nothing",
+        remedy="File names of meshes are relative to the folder of the scene file.",
+    )
+    # Without normals first: Mitsuba computes normals before it validates corners, and writes out of bounds.
     params = _mesh_arrays(path, kind, flat=True)
     points = np.array(params["vertex_positions"], float).reshape(-1, 3)
     faces = np.array(params["faces"], np.int64).reshape(-1, 3)
-    whole = (faces != np.roll(faces, 1, axis=1)).all(axis=1)  # Mitsuba takes a negative corner for the first
-    if not whole.any() or faces.min() < 0 or faces.max() >= len(points):
-        extent = f"corners {faces.min()} to {faces.max()} of {len(points)}" if whole.any() else "no triangle"
+    # Mitsuba replaces a negative corner by the first one.
+    triangles = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
+    if not triangles.any() or faces.min() < 0 or faces.max() >= len(points):
+        found = (
+            f"corners {faces.min()} to {faces.max()} of {len(points)}" if triangles.any() else "no triangle"
+        )
         raise PolarguideError(
-            path, expected="triangles between its points", found=extent, remedy="Export it again."
+            path, expected="triangles between its points", found=found, remedy="Export it again."
         )
     params = _mesh_arrays(path, kind, flat=False)
     normals = np.array(params["vertex_normals"], float).reshape(-1, 3)
@@ -366,15 +432,22 @@ def _user_mesh(path: Path) -> Mesh:
 
 
 def _mesh_arrays(path: Path, kind: str, *, flat: bool) -> Any:
-    """The arrays of a mesh as Mitsuba reads them; ``flat`` leaves normals at points out."""
+    """Return the arrays of a mesh as Mitsuba reads them.
+
+    Args:
+        path: path of the file.
+        kind: "ply" or "obj".
+        flat: leave vertex normals out.
+
+    Raises:
+        PolarguideError: Mitsuba cannot read the file.
+    """
     try:
         return mi.traverse(mi.load_dict({"type": kind, "filename": str(path), "face_normals": flat}))
-    except (
-        RuntimeError,
-        UnicodeDecodeError,
-    ) as error:  # what Mitsuba says ends in the reason, or quotes the file
+    except (RuntimeError, UnicodeDecodeError) as error:
+        # A decoding error quotes the header. Other messages of Mitsuba end with the reason.
         quoted = isinstance(error, UnicodeDecodeError)
-        fault = "a line of its header that is no text" if quoted else str(error)
+        fault = "a line of its header that is not text" if quoted else str(error)
         reason = fault.rpartition("shape plugin of type")[2].partition(": ")[2] or fault
         raise PolarguideError(
             path,
@@ -385,14 +458,18 @@ def _mesh_arrays(path: Path, kind: str, *, flat: bool) -> Any:
 
 
 def _texture(thing: Thing, mesh: Mesh, folder: Path) -> Array | None:
-    """The texture of an object, [H, W, 3], or None if it has one color."""
+    """Return the texture of an object, [H, W, 3], or None for an object of one color.
+
+    Raises:
+        PolarguideError: the texture is invalid, or the mesh has no colors for the color "own".
+    """
     color = thing.material.color
     if color != "own":
         return make_texture(color, thing.name, folder) if isinstance(color, dict) else None
     if mesh.palette is None:
         raise PolarguideError(
             f"{thing.name} material.color",
-            expected='a shape with colors of its own if the color is "own"',
+            expected='a shape with its own colors for the color "own"',
             found=f"a {thing.shape.get('type')} without colors",
             remedy="Give the parts of a solid or the material a color.",
         )
@@ -400,7 +477,14 @@ def _texture(thing: Thing, mesh: Mesh, folder: Path) -> Array | None:
 
 
 def _shape(thing: Thing, mesh: Mesh, path: Path, surface: dict[str, Any]) -> Any:
-    """Mitsuba's shape with its BSDF and attributes."""
+    """Load Mitsuba's shape of an object.
+
+    Args:
+        thing: the object.
+        mesh: its mesh.
+        path: file of the mesh.
+        surface: BSDF and attributes.
+    """
     if thing.shape.get("type") == "ball":
         radius = decode(thing.shape, Ball, f"{thing.name} shape", remedy=REMEDY).radius * thing.scale
         return mi.load_dict({"type": "sphere", "center": list(thing.position), "radius": radius, **surface})

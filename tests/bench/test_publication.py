@@ -8,9 +8,8 @@ from faults import Fault
 
 import polarguide
 from polarguide.training.settings import TrainSettings
-from polarguide_bench.join import join_tables
+from polarguide_bench.join import LAYOUTS, join_tables, measured_section, published_section
 from polarguide_bench.options import CompareOptions
-from polarguide_bench.publication import LAYOUTS, measured_section, published_section
 from polarguide_bench.recipes import recipe_named
 
 FIRST = LAYOUTS["publication-1"]

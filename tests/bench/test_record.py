@@ -10,8 +10,7 @@ from faults import Fault
 
 from polarguide.core.records import decode
 from polarguide_bench.join import join_records, join_tables
-from polarguide_bench.record import Record, read_results
-from polarguide_bench.results import Results
+from polarguide_bench.results import Record, Results, read_results
 from polarguide_bench.tables import scores_section, write_tables
 
 STORED = Path(__file__).parents[2] / "benchmarks" / "results"
@@ -55,7 +54,7 @@ def test_what_is_written_passes(tmp_path: Path) -> None:
             ("runs", 1, "state"),
             "failed",
             "runs[1].metrics",
-            "values for a run that is done and null for another",
+            "values for a finished run",
         ),
         (("runs", 0, "metrics", "psnr"), "high", "runs[0].metrics.psnr", "a number or null"),
         (("runs", 0, "views", "v0", "ssim"), "x", "runs[0].views.v0.ssim", "a number or null"),
@@ -195,7 +194,7 @@ def test_files_and_that_a_part_is_not_written_over(tmp_path: Path) -> None:
     }
     assert "Pictures are in the reports of the parts." in (tmp_path / "all" / "report.html").read_text()
     before = (y / "results.json").read_bytes()
-    Fault(expected="a folder that is none").raised_by(join_tables, [x, y], y)
+    Fault(expected="a folder other than").raised_by(join_tables, [x, y], y)
     assert (y / "results.json").read_bytes() == before
 
 

@@ -153,11 +153,11 @@ def test_every_section_is_on_the_page_and_in_the_browser(tmp_path: Path) -> None
         titles = view.locator("h2:visible").all_inner_texts()
         assert titles[:6] == [
             "Scores on held-out views",
-            "What polarization buys",
+            "Gain by polarization",
             "Differences to 3dgs-dr",
             "By object",
             "By material",
-            "Where the error is",
+            "Error maps",
         ]
         for section in sections(record):
             rows = view.locator(f"#{section.key} tbody tr")

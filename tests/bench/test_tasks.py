@@ -30,7 +30,7 @@ from polarguide_bench.plan import (
     plan_runs,
     scene_entries,
 )
-from polarguide_bench.record import PartScores
+from polarguide_bench.results import PartScores
 from polarguide_bench.tables import write_tables
 
 Planned = tuple[Comparison, list[SceneEntry], PlannedRun]

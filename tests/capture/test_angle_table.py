@@ -124,8 +124,8 @@ def test_the_frame_of_a_filter(tiny: TinyCapture) -> None:
         (["v000_000.png,v000,"], Fault("line 2), v000_000.png", expected="an angle in degrees")),
         (["v000_000.png,v000,0,-1"], Fault("line 2), v000_000.png", expected="a gain from 1e-06 to 1e+06")),
         (["v000_000.png,,0"], Fault(expected="the picture of view v000 at 0 degrees")),
-        (["../v000_000.png,v000,0"], Fault("line 2)", "a picture in polar/", "none called ../v000")),
-        (["", "gone.png,v000,0"], Fault("line 3)", "a picture in polar/", "none called gone.png")),
+        (["../v000_000.png,v000,0"], Fault("line 2)", "a picture in polar/", "../v000")),
+        (["", "gone.png,v000,0"], Fault("line 3)", "a picture in polar/", "gone.png")),
     ],
 )
 def test_each_fault_is_one_line(tiny: TinyCapture, lines: list[str], fault: Fault) -> None:

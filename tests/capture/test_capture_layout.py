@@ -62,7 +62,7 @@ FAULTS: dict[str, tuple[Callable[[TinyCapture], object], Fault]] = {
     ),
     "no folder of an angle": (
         folders_without("", "I-00", "I-45", "I-90", "polarizer135"),
-        Fault(expected="four folders", found="none for 135 degrees beside I-00, I-45, I-90", remedy="Add the folder"),
+        Fault(expected="four folders", found="none for 135", remedy="Add the folder"),
     ),
     "two folders of an angle": (
         two_folders, Fault(expected="one folder for 45 degrees", found="45 and I-45", remedy="Remove or rename")
@@ -115,11 +115,9 @@ def test_files_that_are_passed_over_are_reported_once(capture: TinyCapture) -> N
     capture.write_truth("v000_gt")
     scene = load_scene(capture.root)
     assert len(scene.views) == 9
-    assert scene.warnings == (
-        "polar/ has pictures whose names do not end in _000, _045, _090 or _135, which are not used "
-        "(preview.png, v000_180.png, v001_000_small.png).",
-        "gt/ has files without a view, which are not used (v000_gt.npz): name each file like its view.",
-    )
+    pictures, truth = scene.warnings
+    assert "(preview.png, v000_180.png, v001_000_small.png)" in pictures
+    assert "(v000_gt.npz)" in truth
 
 
 def test_view_names_may_contain_underscores_and_digits(capture: TinyCapture) -> None:

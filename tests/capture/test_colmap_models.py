@@ -101,7 +101,7 @@ def test_names_of_text_models_are_not_cut(tmp_path: Path, name: str, view: str) 
     ("lines", "found"),
     [
         ("1 1 0 0 0 0 0 0 1 a.png\n2 1 0 0 0 0 0 0 1 b.png\n", "line 2"),  # one line an image
-        ("1 1 0 0 0 0 0 0 1 a.png\n\n1 1 0 0 0 0 0 0 1 b.png\n\n", "image 1 stands there twice"),
+        ("1 1 0 0 0 0 0 0 1 a.png\n\n1 1 0 0 0 0 0 0 1 b.png\n\n", "image 1"),
         ("1 1 0 0 0 0 0 0 1\n\n", "line 1"),
         ("1 1 0 0 0 0 0 0 1 a.png\n1 2\n", "line 2"),
     ],
@@ -224,11 +224,11 @@ FAULTS: dict[str, tuple[Callable[[TinyCapture], object], Fault]] = {
     ),
     "no model": (
         lambda capture: model_folder(capture).rename(capture.root / "model"),
-        Fault("sparse/0", "a COLMAP model", "neither there nor in sparse/", "structure from motion"),
+        Fault("sparse/0", "a COLMAP model", "sparse/", "structure from motion"),
     ),
     "an incomplete model": (
         lambda capture: (model_folder(capture) / "images.txt").unlink(),
-        Fault("images.txt", found="nothing", remedy="cameras.txt, images.txt and points3D.txt together"),
+        Fault("images.txt", found="nothing", remedy="points3D.txt"),
     ),
     "images cut short": (broken_binary("images.bin", lambda data: data[:20]), Fault("sparse/0")),
     "points cut short": (broken_binary("points3D.bin", lambda data: data[:20]), Fault("sparse/0")),
@@ -293,7 +293,8 @@ def test_points_that_are_not_finite_are_left_out(capture: TinyCapture) -> None:
     model.write_binary(str(model_folder(capture)))
     scene = load_scene(capture.root)
     assert scene.points.shape == (2, 3)
-    assert scene.warnings == ("2 of 4 3D points are not finite, or farther than 1e+09, and were left out.",)
+    (warning,) = scene.warnings
+    assert "2 of 4 3D points" in warning
 
 
 def test_pose_without_pictures(capture: TinyCapture) -> None:

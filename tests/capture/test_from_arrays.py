@@ -135,7 +135,7 @@ GOOD = np.full((4, 6, 8), 100, np.uint8)
         (
             {"pictures": [GOOD / 100, GOOD / 100], "transfer": "srgb"},
             "pictures (v000)",
-            "floats, which are linear",
+            "floats",
         ),
     ],
 )

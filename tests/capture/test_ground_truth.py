@@ -117,8 +117,8 @@ def test_a_table_that_nothing_refers_to_may_lack_fields(capture: TinyCapture) ->
 @pytest.mark.parametrize(
     ("objects", "parts"),
     [
-        ([CUP, {**GROUND, "id": 2}], ("(objects)", "each has its own id", "two with the id 2")),
-        ([CUP, {**GROUND, "name": "cup"}], ("(objects)", "each has its own name", "two with the name cup")),
+        ([CUP, {**GROUND, "id": 2}], ("(objects)", "unique id", "2 with the id 2")),
+        ([CUP, {**GROUND, "name": "cup"}], ("(objects)", "unique name", "2 with the name cup")),
         ([{"name": "cup"}], ("(objects[0])", "the field id", "only name")),
         ([{**CUP, "id": 0}], ("(objects[0].id)", "1 to 65535", "found 0")),
         ([{**CUP, "id": "two"}], ("(objects[0].id)", "a whole number", '"two"')),

@@ -120,7 +120,7 @@ def test_many_objects_are_compared_in_no_time() -> None:
     path = Path("scene.json")
     assert len(objects_of(path, json.dumps({"objects": objects}).encode())) == 59_999
     twice = json.dumps({"objects": [*objects, {"id": 5, "name": "x"}]}).encode()
-    Fault(found="two with the id 5").raised_by(objects_of, path, twice)
+    Fault(found="with the id 5").raised_by(objects_of, path, twice)
 
 
 SENSOR = '<sensor id="0"><calibration><resolution width="{w}" height="24"/><f>40</f></calibration></sensor>'

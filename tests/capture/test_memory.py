@@ -49,7 +49,7 @@ def png_of(width: int, height: int) -> bytes:
 
 def test_pictures_that_do_not_fit_are_refused(capture: TinyCapture) -> None:
     needed = (KEPT * len(NAMES) + 4 * READ) * 120 / 2**30
-    Fault(expected="as --memory allows", found="9 views that take", remedy="--downscale 2").raised_by(
+    Fault(expected="--memory", found="9 views that take", remedy="--downscale 2").raised_by(
         load_scene, capture.root, memory=0.99 * needed
     )
     with pytest.raises(AssertionError):
@@ -63,7 +63,7 @@ def test_without_a_wish_most_of_what_is_free_may_be_taken(
     capture: TinyCapture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("polarguide.capture.layout.free_memory", lambda: 1000)
-    Fault(expected="80% of what is free").raised_by(load_scene, capture.root)
+    Fault(expected="80%").raised_by(load_scene, capture.root)
 
 
 def test_24_huge_pictures_are_refused_by_their_camera(capture: TinyCapture) -> None:

@@ -323,7 +323,7 @@ PICTURES: dict[str, tuple[Callable[[TinyCapture], object], Fault]] = {
     ),
     "another size than its camera": (
         lambda capture: capture.write_view("v003", ideal_intensities(0, height=8, width=12)),
-        Fault("camera of view v003", "the size of the pictures, 12x8", "12x10", "no crop"),
+        Fault("camera of view v003", "the size of the pictures, 12x8", "12x10", "crop"),
     ),
     "a view of another depth": (
         lambda capture: capture.write_view("v003", capture.linear["v003"], bits=8),
@@ -363,7 +363,7 @@ def test_floating_point_pictures(capture: TinyCapture) -> None:
 def test_mask_of_another_size_or_damaged(capture: TinyCapture, folder: str) -> None:
     path = capture.root / folder / "v002.png"
     write_picture(path, np.ones((12, 10)), bits=8)
-    Fault(f"{folder}/v002.png", "the size of the pictures, 12x10", "10x12", "Make it anew").raised_by(
+    Fault(f"{folder}/v002.png", "the size of the pictures, 12x10", "10x12", "for these pictures").raised_by(
         load_scene, capture.root
     )
     write_picture(path, np.ones((10, 12)), bits=8)

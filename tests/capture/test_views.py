@@ -73,7 +73,7 @@ def test_a_picture_that_has_changed_is_refused(tmp_path: Path) -> None:
     capture = write_tiny_capture(tmp_path / "tiny")
     scene = load_scene(capture.root, hold=False)
     capture.write_view("v004", ideal_intensities(99))
-    Fault("v004_000.png", expected="the file that was there").raised_by(lambda: scene.view("v004").codes)
+    Fault("v004_000.png", expected="the same file").raised_by(lambda: scene.view("v004").codes)
     (capture.root / "polar" / "v005_090.png").unlink()
     Fault("v005_090.png").raised_by(lambda: scene.view("v005").codes)
 

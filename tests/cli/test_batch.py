@@ -8,9 +8,10 @@ from faults import Fault
 
 from polarguide.cli.app import run
 from polarguide_bench import batch as batches
-from polarguide_bench.batch import Capture, CaptureRow
+from polarguide_bench import verbs
+from polarguide_bench.batch import CaptureRow
+from polarguide_bench.children import Capture
 from polarguide_bench.options import BatchOptions
-from polarguide_bench.verbs import batch as verb
 
 OPTIONS = BatchOptions(jobs=1, device="cpu")
 HEAD = "name,path,sensor,options\n"
@@ -26,7 +27,7 @@ HEAD = "name,path,sensor,options\n"
         (HEAD + "cup,a,,,,\n", Fault("line 2", "4 values", "more")),
         (HEAD + "../cup,a,,\n", Fault("line 2", "name")),
         (HEAD + "cup,,,\n", Fault("line 2", "path")),
-        (HEAD + "cup,a,,\n\nCup,b,,\n", Fault("line 4", "names of their own", "line 2")),
+        (HEAD + "cup,a,,\n\nCup,b,,\n", Fault("line 4", "different names", "line 2")),
         (HEAD + "cup,a\0b,,\n", Fault("line 2", found="a null character")),
         (HEAD + "cup\0,a,,\n", Fault("line 2", found="a null character")),
         (HEAD + "cup,a,,\n" + 'mug,"b,,\n', Fault("line 3", found="unexpected end of data")),
@@ -41,7 +42,7 @@ HEAD = "name,path,sensor,options\n"
 )
 def test_a_wrong_table_is_refused_before_anything_is_written(tmp_path: Path, text: str, fault: Fault) -> None:
     (tmp_path / "list.csv").write_text(text)
-    fault.raised_by(verb.batch, tmp_path / "list.csv", out=tmp_path / "out", settings=OPTIONS)
+    fault.raised_by(verbs.batch, tmp_path / "list.csv", out=tmp_path / "out", settings=OPTIONS)
     assert not (tmp_path / "out").exists()
 
 
@@ -85,8 +86,9 @@ def test_a_watched_folder_is_taken_once_nothing_in_it_changes(
 
     def instead(captures: list[Capture], out: Path, *_: Any, **__: Any) -> list[CaptureRow]:
         asked.append([capture.name for capture in captures])
+        record: Any = None
         return [
-            CaptureRow(name, "", out, "failed" if name == "b" else "done", "broken", None)
+            CaptureRow(name, "", out, "failed" if name == "b" else "done", "broken", record)
             for name in asked[-1]
         ]
 
@@ -106,11 +108,11 @@ def test_a_watched_folder_is_taken_once_nothing_in_it_changes(
         if coming:
             coming.pop(0)()
 
-    monkeypatch.setattr(verb.time, "sleep", sleep)
+    monkeypatch.setattr(verbs.time, "sleep", sleep)
     with pytest.raises(KeyboardInterrupt):
-        verb.batch(tmp_path / "all", out=tmp_path / "out", watch=5, settings=OPTIONS)
+        verbs.batch(tmp_path / "all", out=tmp_path / "out", watch=5, settings=OPTIONS)
     printed = capsys.readouterr()
     assert (printed.out + printed.err).count("broken") == 1
     assert "no capture" not in printed.out + printed.err  # an empty station waits
     nowhere = tmp_path / "nowhere"
-    Fault("nowhere", found="no such").raised_by(verb.batch, nowhere, out=tmp_path, watch=5, settings=OPTIONS)
+    Fault("nowhere", found="no such").raised_by(verbs.batch, nowhere, out=tmp_path, watch=5, settings=OPTIONS)

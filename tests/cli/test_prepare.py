@@ -62,7 +62,7 @@ def test_a_dataset_becomes_a_scene_that_trains(tmp_path: Path, capsys: pytest.Ca
     printed = " ".join(capsys.readouterr().out.split())
     assert "4 views, format nersp" in printed
     assert "Four-angle sum check: n/a" in printed
-    assert "warning: The sense of nersp's angles is not certain" in printed
+    assert "warning: The sense of nersp's angles is uncertain" in printed
     assert "Angles count clockwise as displayed, as assumed (--sense and --zero say otherwise)" in printed
     assert "sampled at random in the hull of the masks" in printed
     assert run(["train", scene, "--out", out, "--steps", "2", "--threads", "1"]) == 0

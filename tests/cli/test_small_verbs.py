@@ -22,7 +22,7 @@ from polarguide.runs.folder import CHECKPOINT, LOG
 from polarguide.training.settings import TrainSettings
 from polarguide_bench.options import CompareOptions
 from polarguide_bench.plan import Comparison, plan_runs, scene_entries
-from polarguide_bench.record import read_results
+from polarguide_bench.results import read_results
 from polarguide_shots.ring_scale import ring_scale
 from polarguide_synth.schema import SceneSpec
 from polarguide_synth.settings import Variant, choose_variant
@@ -183,7 +183,7 @@ def test_interrupted_failed_and_finished(
     (second / "run.json").write_text("{}")
     assert run(command) == 2
     said = capsys.readouterr()
-    assert "expected 2 finished runs, found that 1 failed (demo, 3dgs, seed 0: " in said.err
+    assert "1 failed runs (demo, 3dgs, seed 0: " in said.err
     assert f"{second}/run.json: expected " in said.err
     assert len(said.err.splitlines()) == 1
     assert "done  demo, 3dgs-dr, seed 0" in said.out

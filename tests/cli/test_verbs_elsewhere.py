@@ -26,8 +26,8 @@ from polarguide.results.evaluation.target import SceneFacts, ViewTarget
 from polarguide.runs import opened as opening
 from polarguide.viewer import run_scenery
 from polarguide.viewer.scenery import Appearance, Painter
-from polarguide_bench.record import read_results
-from polarguide_bench.verbs.compare import chosen_steps
+from polarguide_bench.results import read_results
+from polarguide_bench.verbs import chosen_steps
 
 
 @pytest.fixture

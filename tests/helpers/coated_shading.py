@@ -27,8 +27,8 @@ class CoatedShading(DeferredShading):
     """final = base + strength F(i) light + 0.04 clearcoat light."""
 
     @property
-    def added_surface(self) -> tuple[SurfaceProperty, ...]:
-        return (CLEARCOAT,)
+    def surface(self) -> tuple[SurfaceProperty, ...]:
+        return (*super().surface, CLEARCOAT)
 
     def shade(self, splatted: GBuffer, light: Light, camera: Camera) -> dict[str, Any]:
         layers = super().shade(splatted, light, camera)

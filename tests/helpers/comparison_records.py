@@ -4,8 +4,7 @@ from typing import Any
 
 from polarguide.core.records import decode
 from polarguide.results.evaluation.table import COLUMNS
-from polarguide_bench.record import FORMAT, Record
-from polarguide_bench.results import Results
+from polarguide_bench.results import FORMAT, Record, Results
 
 
 def run(scene: str, recipe: str, seed: int, **metrics: float | None) -> dict[str, Any]:

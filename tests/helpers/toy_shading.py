@@ -16,7 +16,6 @@ from polarguide.shading.model import (
     Parameter,
     Parameters,
     ShadingModel,
-    base_colors,
     mirrored,
 )
 from polarguide.training.recipe import Stage, Weights
@@ -57,10 +56,9 @@ class SkyShading(ShadingModel):
         above = 0.5 - 0.5 * directions[..., 1:2]
         return torch.exp(torch.lerp(light["sky"][0], light["sky"][1], above))
 
-    def channels(self, gaussians: Parameters, normals: Tensor, center: Tensor, degree: int) -> Channels:
+    def channels(self, gaussians: Parameters, center: Tensor, degree: int) -> Channels:
         gloss = torch.sigmoid(gaussians["gloss_logits"])[:, None]
-        color = base_colors(gaussians, center, degree)
-        return {"color": color, "gloss": gloss, "mirror": gloss * gaussians["tint"]}
+        return Channels(further={"gloss": gloss, "mirror": gloss * gaussians["tint"]})
 
     def shade(self, splatted: GBuffer, light: Light, camera: Camera) -> dict[str, Tensor]:
         base, normal = splatted["color"], splatted["normal"]
@@ -68,10 +66,6 @@ class SkyShading(ShadingModel):
         specular = splatted["mirror"] * self.sky(light, mirrored(rays, unit(normal, 1e-3)))
         strength = splatted["gloss"][..., 0]
         return {"final": base + specular, "specular": specular, "diffuse": base, "strength": strength}
-
-    def colors(self, gaussians: Parameters, light: Light, rays: Tensor, normals: Tensor) -> Tensor:
-        gloss = torch.sigmoid(gaussians["gloss_logits"])[:, None] * gaussians["tint"]
-        return self.diffuse_colors(gaussians, rays) + gloss * self.sky(light, mirrored(rays, normals))
 
 
 _BASE = RECIPES["polarguide"]

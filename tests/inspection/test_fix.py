@@ -131,7 +131,7 @@ def test_no_link_that_leaves_the_scene_is_copied(tmp_path, name: str) -> None:
     (root / name).symlink_to(secret if name == "gt" else secret / "key")
     capture = replace(read_capture(write_scene(tmp_path / "right")), root=root)
     change = Calibration(order=ORDERS[3].files(PAIRINGS[0]))
-    Fault(found="a link to", remedy="nothing was written").raised_by(
+    Fault(found="a link to", remedy="Nothing was written").raised_by(
         fixing.fix_scene, capture, change, tmp_path / "fixed"
     )
     assert not (tmp_path / "fixed").exists()

@@ -111,7 +111,7 @@ def test_what_does_not_fit_is_refused(tmp_path: Path) -> None:
         corrected, read_capture(root), tmp_path / "small.safetensors"
     )
     turned = scene(tmp_path / "turned", replace(PLAIN, calibration=Calibration(zero=10.0)))
-    Fault(found="a scene whose zero was turned").raised_by(
+    Fault(found="a scene with another zero").raised_by(
         corrected, read_capture(turned), tmp_path / "turned" / "camera.safetensors"
     )
 
@@ -120,7 +120,7 @@ def test_what_does_not_fit_is_refused(tmp_path: Path) -> None:
     ("change", "words"),
     [
         ({"geometry": {"step": 0}}, "a step of 0"),
-        ({"geometry": {"size": [2, 2]}}, "a size that its pictures have not"),
+        ({"geometry": {"size": [2, 2]}}, "a size that differs"),
         ({"warp": {"model": "NOPE", "parameters": []}}, 'a camera "NOPE"'),
         ({"warp": {"model": "PINHOLE", "parameters": [1.0]}}, "with 1 parameters"),
     ],

@@ -41,7 +41,7 @@ def test_views_on_automatic_exposure_are_named_and_made_even(
     strong = {name for name, stop in zip(gains, stops - stops.mean(), strict=True) if abs(stop) > 0.35}
     assert len(strong - set(check.views)) <= 0.1 * len(strong)
     scene = polarguide.load_scene(tmp_path / "auto", downscale=2)
-    assert any("exposed or white-balanced otherwise" in text for text in scene.warnings)
+    assert any("exposure or white balance" in text for text in scene.warnings)
     even = polarguide.load_scene(whole_demo, downscale=2)
     true = np.log2(np.array(list(gains.values())))
     found = np.log2(np.array([view.gains for view in scene.views]))
@@ -77,7 +77,7 @@ def test_gains_none_leaves_exposures(whole_demo: Path, tmp_path: Path) -> None:
     }
     check = view_exposure_check(read_capture(tmp_path / "auto"))
     assert check.verdict == "warning"
-    assert "--gains none left them" in check.remedy
+    assert "--gains none" in check.remedy
 
 
 class Model:

@@ -11,10 +11,10 @@ from polarguide import _native
 from polarguide.geometry.camera import Camera
 from polarguide.shading.deferred import DeferredShading
 from polarguide.shading.gbuffer import shaded
-from polarguide.shading.metal import MINIMUM_SHARE, where_metal
+from polarguide.shading.metal import where_metal
 from polarguide.shading.model import GBuffer
 from polarguide.shading.native import DETACHED, MetalArguments, ReflectArguments, reflect_native
-from polarguide.shading.result import Layout
+from polarguide.shading.result import ChannelSlices, channel_slices
 
 HEIGHT, WIDTH, RESOLUTION = 20, 24, 32
 MODELS = [
@@ -58,11 +58,11 @@ def buffers(shading: DeferredShading) -> tuple[Tensor, Tensor]:
     return torch.cat([*parts, uniform(HEIGHT, WIDTH, 1)], dim=-1), texels
 
 
-def layout(shading: DeferredShading, *, metal: bool = True) -> Layout:
+def layout(shading: DeferredShading, *, metal: bool = True) -> ChannelSlices:
     own = {"local": 3} if shading.local else {}
-    return Layout(
+    return channel_slices(
         {"color": 3, "normal": 3, "strength": 1, **own, "blur": 1}
-        | ({"metal": 4, "depth": 1} if metal else {})
+        | ({"reflectance": 3, "metalness": 1, "depth": 1} if metal else {})
     )
 
 
@@ -165,7 +165,7 @@ def test_light_that_is_not_trained_gets_no_gradient() -> None:
 def test_what_does_not_fit_is_refused(name: str, changed: dict[str, Any]) -> None:
     features, texels = buffers(MODELS[0])
     flat = features.flatten(0, 1)
-    given = MetalArguments(where_metal(flat, 11), 11, MINIMUM_SHARE)._replace(**changed)
+    given = MetalArguments(where_metal(flat, 11), 11)._replace(**changed)
     rays = camera().world_rays().flatten(0, 1)
     with pytest.raises(ValueError, match=name):
         reflect_native(flat, rays, [texels.exp()], ReflectArguments(True, True, 1.5, metal=given))

@@ -14,10 +14,9 @@ from polarguide.shading.native import (
     DETACHED,
     ReflectArguments,
     reflect_native,
-    reflect_reference,
     world_rays_native,
 )
-from polarguide.shading.result import Layout
+from polarguide.shading.result import channel_slices
 
 HEIGHT, WIDTH, RESOLUTION = 20, 24, 8
 MODELS = [
@@ -61,9 +60,7 @@ def native(features: Tensor, texels: Tensor, shading: DeferredShading) -> tuple[
 
 def reference(features: Tensor, texels: Tensor, shading: DeferredShading) -> tuple[Tensor, ...]:
     local = features[..., 7:10] if shading.local else None
-    layers = reflect_reference(
-        features[..., :3], features[..., 3:6], features[..., 6], texels, camera(), shading, local
-    )
+    layers = shading.reflect(features[..., :3], features[..., 3:6], features[..., 6], texels, camera(), local)
     return tuple(layers[name].flatten(0, 1) for name in LAYERS)
 
 
@@ -143,7 +140,7 @@ def test_held_layers_are_those_of_normals_without_a_gradient(
     simd: str, shading: DeferredShading, wanted: tuple[int, ...]
 ) -> None:
     """Against shading a second time, both with a gradient of the picture that does reach the normals."""
-    layout = Layout({"color": 3, "normal": 3, "strength": 1, "local": 3})
+    layout = channel_slices({"color": 3, "normal": 3, "strength": 1, "local": 3})
     grid = torch.linspace(-1, 2, HEIGHT * WIDTH * 3).reshape(HEIGHT, WIDTH, 3)
     results = []
     for native in (True, False):

@@ -20,10 +20,10 @@ from polarguide.geometry.camera import Camera
 from polarguide.raster.cpu import rasterize_cpu
 from polarguide.raster.interface import Splats
 from polarguide.shading.deferred import DeferredShading
-from polarguide.shading.gbuffer import splatting, splatting_reference, split, split_reference
-from polarguide.shading.model import PLAIN, Parameters, ShadingModel, base_colors
+from polarguide.shading.gbuffer import splatting, split, split_reference
+from polarguide.shading.model import PLAIN, Channels, Parameters, ShadingModel, base_colors
 from polarguide.shading.native import split_native
-from polarguide.shading.result import Layout
+from polarguide.shading.result import ChannelSlices, channel_slices
 from polarguide.training.losses import flatness_loss, flatness_loss_reference
 
 TURN = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(5), dtype=torch.float64))[0]
@@ -78,9 +78,7 @@ def test_kernel_agrees_with_the_reference(
     shading, how = MODELS[model], {"sh_degree": degree, "normals": True, "depth": depth}
     given = gaussians(count)
     found, gradients = with_gradients(splatting, given, shading, **how)
-    exact, reference = with_gradients(
-        splatting_reference, {k: t.double() for k, t in given.items()}, shading, **how
-    )
+    exact, reference = with_gradients(splatting, {k: t.double() for k, t in given.items()}, shading, **how)
     assert found.features.grad_fn is not None
     assert type(found.features.grad_fn).__name__ == "_SplattingBackward"
     for name, mine, theirs in zip(Splats._fields, found, exact, strict=True):
@@ -103,7 +101,7 @@ def test_plain_splats_with_and_without_normals(normals: bool, oriented: bool) ->
     if not oriented:
         del given["outward"]
     how = {"sh_degree": 2, "normals": normals, "depth": False}
-    found, expected = (f(given, CAMERA, PLAIN, **how)[0] for f in (splatting, splatting_reference))
+    found, expected = (splatting(given, CAMERA, PLAIN, **how, native=native)[0] for native in (True, False))
     assert found.features.shape == (40, 6 if normals else 3)
     assert_close(found.features, expected.features, rtol=1e-5, atol=3e-6)
 
@@ -161,25 +159,16 @@ def test_not_a_number_and_too_much_are_not_hidden() -> None:
         Fault("rasterize(", "finite", "Gaussian 7").raised_by(rasterize_cpu, broken, CAMERA)
 
 
-def test_a_model_with_channels_of_its_own_is_asked_for_them() -> None:
+def test_a_model_with_its_own_color_uses_the_reference() -> None:
     class Doubled(DeferredShading):
-        def channel_parameters(self, gaussians: Parameters) -> None:
-            return None
-
-        def channels(
-            self, gaussians: Parameters, normals: Tensor, center: Tensor, degree: int
-        ) -> dict[str, Tensor]:
+        def channels(self, gaussians: Parameters, center: Tensor, degree: int) -> Channels:
             color = 2 * base_colors(gaussians, center, degree)
-            return {"color": color, "strength": self.strength(gaussians)[:, None]}
+            return super().channels(gaussians, center, degree)._replace(color=color)
 
     given, how = gaussians(10), {"sh_degree": 3, "normals": True, "depth": False}
     twice, once = (splatting(given, CAMERA, model, **how)[0] for model in (Doubled(), DeferredShading()))
     assert_close(twice.features[:, :3], 2 * once.features[:, :3], rtol=1e-5, atol=3e-6)
-
-
-def test_a_model_that_replaces_its_channels_has_to_say_what_their_kernel_is() -> None:
-    with pytest.raises(TypeError, match="channel_parameters"):
-        type("Wrapped", (DeferredShading,), {"channels": DeferredShading.channels})
+    assert_close(twice.features[:, 3:], once.features[:, 3:], rtol=1e-5, atol=3e-6)
 
 
 def test_wrong_shapes_are_refused() -> None:
@@ -209,8 +198,10 @@ HEIGHT, WIDTH, CHANNELS = 40, 61, 11
 SIZE = (HEIGHT, WIDTH)
 
 
-def layout(*, depth: bool) -> Layout:
-    return Layout({"color": 3, "normal": 3, "own": CHANNELS - 6 - depth, **({"depth": 1} if depth else {})})
+def layout(*, depth: bool) -> ChannelSlices:
+    return channel_slices(
+        {"color": 3, "normal": 3, "own": CHANNELS - 6 - depth, **({"depth": 1} if depth else {})}
+    )
 
 
 def buffers(dtype: torch.dtype) -> tuple[Tensor, Tensor]:
@@ -252,10 +243,10 @@ def test_threads_do_not_change_the_split() -> None:
 
 def test_without_further_channels_the_slices_do() -> None:
     features, alpha = torch.rand(*SIZE, 6), torch.rand(SIZE)
-    _, normal, depth = split(features, alpha, Layout({"color": 3, "normal": 3}))
+    _, normal, depth = split(features, alpha, channel_slices({"color": 3, "normal": 3}))
     assert torch.equal(normal, features[..., 3:6])
     assert depth is None
-    assert split(features, alpha, Layout({"color": 3, "own": 3}))[1] is None
+    assert split(features, alpha, channel_slices({"color": 3, "own": 3}))[1] is None
     with pytest.raises(ValueError, match="features: "):
         split_native(features, alpha, depth=True)
 

@@ -20,7 +20,7 @@ from polarguide.capture.calibration import Calibration
 from polarguide.preparation.settings import PrepareSettings
 
 # The light of these tests has no outlines: nothing tells the sense of NeRSP's and NeISF's angles.
-pytestmark = pytest.mark.filterwarnings("ignore:The sense of .* is not certain")
+pytestmark = pytest.mark.filterwarnings("ignore:The sense of .* is uncertain")
 
 
 def npz(name: str, **changes: object) -> Callable[[Path], None]:
@@ -122,7 +122,7 @@ CELLS: dict[str, tuple[str, Callable[[Path], object], Fault]] = {
     ),
     "pandora: no pictures": (
         "pandora", lambda d: shutil.rmtree(d / "images"),
-        Fault(expected="intrinsics belong to", found="none")
+        Fault(expected="pictures of the intrinsics", found="none")
     ),
     "pandora: another aspect": (
         "pandora", lambda d: write_picture(d / "images" / "01.png", np.ones((96, 140, 3)), bits=8),
@@ -135,7 +135,7 @@ CELLS: dict[str, tuple[str, Callable[[Path], object], Fault]] = {
     ),
     "pandora: mask of another aspect": (
         "pandora", lambda d: write_picture(d / "mask" / "01.png", disc(48, 80).astype(float), bits=8),
-        Fault("mask of view 01", expected="the aspect of the pictures, 64x48"),
+        Fault("mask of view 01", expected="64x48"),
     ),
     "pandora: no files": (
         "pandora", lambda d: [p.unlink() for p in (d / "images_stokes").iterdir()],
@@ -291,7 +291,7 @@ def test_datasets(tmp_path: Path, case: str) -> None:
         (
             "nersp",
             {"sensor": "IMX250MYR"},
-            Fault("--sensor", expected="only flags that apply to the format nersp"),
+            Fault("--sensor", expected="the format nersp"),
         ),
         ("pandora", {"transfer": "srgb"}, Fault("--transfer", found="gnerp")),
         ("pisr", {"align": False}, Fault("--align", expected="format pisr")),

@@ -500,7 +500,7 @@ def test_a_tag_that_one_file_of_several_lacks_corrects_nothing(tmp_path, name, v
     gains, missing = stated_exposures({"cup": files[:1], "other": files[1:]})
     assert not gains
     assert "1 of 3 files have no" in missing
-    assert "EXIF corrects no exposure" in missing
+    assert "not corrected by EXIF" in missing
     assert missing in read_shot(tmp_path, ShotOptions()).notes
     measured = SinglesSource(tmp_path, PrepareSettings(poses="none")).measure(lambda done: None)
     assert (measured.light, measured.notes[-1]) == ({}, missing)

@@ -60,7 +60,7 @@ def test_four_shots_in_a_row_become_one_view(tmp_path: Path, given: int | None) 
     heard = Heard()
     done = prepare_scene(tmp_path / "in", tmp_path / "out", settings, heard)
     assert done.views == [f"DSC_{4 * k + 1:04d}" for k in range(PLACES)]
-    assert any("show one place and are one view" in text for text in heard.said) == (given is None)
+    assert any("consecutive pictures show one place" in text for text in heard.said) == (given is None)
     truth = behind(glossy(0), (0, 45, 90, 135))
     for angle, expected in zip((0, 45, 90, 135), truth, strict=True):
         picture = cv2.imread(
@@ -72,7 +72,7 @@ def test_four_shots_in_a_row_become_one_view(tmp_path: Path, given: int | None) 
 @pytest.mark.parametrize(
     ("changes", "fault"),
     [
-        ({}, Fault(expected="the angles of shots", found="4 each in a row", remedy="--shots-per-view 4")),
+        ({}, Fault(expected="the angles of shots", found="groups of 4", remedy="--shots-per-view 4")),
         ({"angles": "0,60"}, Fault("--angles", expected="4 angles", found="0,60")),
         (
             {"angles": "0,60", "shots_per_view": 4},
@@ -82,7 +82,7 @@ def test_four_shots_in_a_row_become_one_view(tmp_path: Path, given: int | None) 
             {"angles": "0,60,120", "shots_per_view": 3},
             Fault("--angles", expected="divisible by 3", found="32 in"),
         ),
-        ({"shots_per_view": 4}, Fault("--shots-per-view", expected="--angles beside it")),
+        ({"shots_per_view": 4}, Fault("--shots-per-view", expected="--angles")),
     ],
 )
 def test_shots_in_a_row_without_fitting_angles_are_refused(
@@ -122,7 +122,7 @@ def test_pictures_without_a_sign_of_a_filter_are_photographs(
         assert cv2.imwrite(str(tmp_path / "in" / f"{name}.{suffix}"), pixels)
     heard = Heard()
     prepare_scene(tmp_path / "in", tmp_path / "out", PLAIN, heard)
-    assert any("Nothing tells of a filter" in text for text in heard.said)
+    assert any("ordinary photographs" in text for text in heard.said)
     assert (tmp_path / "out" / "polar" / "a_none.png").exists()
 
 
@@ -131,7 +131,7 @@ def test_pictures_numbered_like_angles_are_no_photographs(tmp_path: Path, name: 
     """Names that no rule reads, of four pictures that differ in 0, 45, 90 and 135 alone."""
     for place, angle in enumerate((0, 45, 90, 135)):
         write_picture(tmp_path / "in" / f"{name.format(angle)}.png", busy_light(48, 64, place)[0] / 2)
-    Fault(found="numbered like angles").raised_by(prepare_scene, tmp_path / "in", tmp_path / "out", PLAIN)
+    Fault(found="angles in another form").raised_by(prepare_scene, tmp_path / "in", tmp_path / "out", PLAIN)
     done = prepare_scene(tmp_path / "in", tmp_path / "out", replace(PLAIN, angles="none"))
     assert len(done.views) == 4
 

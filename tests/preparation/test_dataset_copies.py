@@ -23,13 +23,14 @@ from dataset_files import (
 )
 from faults import Fault
 
+from polarguide.capture.angle_evidence import OutlineAgreement, outline_agreement, sense_of_outlines
 from polarguide.capture.calibration import Calibration
 from polarguide.capture.datasets.dataset import Dataset, read_mask
 from polarguide.capture.datasets.readers import detect_dataset, open_dataset
 from polarguide.core.errors import PolarguideWarning
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import PrepareSettings
-from polarguide.preparation.source import RimAgreement, StokesSource, rim_agreement, sense_of_rims
+from polarguide.preparation.source import StokesSource
 
 Change = Callable[[Path], object]
 
@@ -170,7 +171,7 @@ def test_sizes_that_no_principal_point_fits_are_warned_of(tmp_path: Path) -> Non
 
 
 def test_no_view_takes_the_mask_of_another_by_number(tmp_path: Path) -> None:
-    with pytest.warns(PolarguideWarning, match=r"no mask called like 4 of 4 views \(01, 02, 03, 04\)"):
+    with pytest.warns(PolarguideWarning, match=r"4 of 4 views \(01, 02, 03, 04\)"):
         assert not changed(tmp_path / "in", "pandora", (masks_from(0),)).masks
 
 
@@ -230,11 +231,11 @@ def ball(sense: int = 1, zero: float = 0.0) -> np.ndarray:
 @pytest.mark.parametrize("zero", [0.0, 25.0])
 def test_outlines_tell_the_sense(sense: int, told: str, zero: float) -> None:
     light = ball(sense, zero).astype(np.float32)
-    agreement = rim_agreement(light, disc(), np.radians(zero))
+    agreement = outline_agreement(light, disc(), np.radians(zero))
     assert agreement is not None
     assert max(agreement.ccw, agreement.cw) > 0.9
     assert abs(min(agreement.ccw, agreement.cw)) < 0.2
-    assert sense_of_rims([agreement] * 4) == told
+    assert sense_of_outlines([agreement] * 4) == told
 
 
 @pytest.mark.parametrize(
@@ -249,7 +250,7 @@ def test_outlines_tell_the_sense(sense: int, told: str, zero: float) -> None:
     ],
 )
 def test_views_that_agree_tell_the_sense(views: list[tuple[float, float]], told: str | None) -> None:
-    assert sense_of_rims([RimAgreement(*view) for view in views]) == told
+    assert sense_of_outlines([OutlineAgreement(*view) for view in views]) == told
 
 
 def measured(root: Path, given: str | None = None) -> str:

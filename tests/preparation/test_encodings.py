@@ -130,7 +130,7 @@ def test_more_specific_statements_go_first(tmp_path):
 def test_pictures_that_state_different_encodings_are_refused(tmp_path):
     first = write(tmp_path / "a.png", light([0])[0][0])
     second = with_chunk(write(tmp_path / "b.png", light([0])[0][0]), b"sRGB", b"\0")
-    Fault(found="states none").raised_by(stated_transfer, [first, second])
+    Fault(found="without a stated encoding").raised_by(stated_transfer, [first, second])
     with_chunk(first, b"gAMA", struct.pack(">I", 100000))
     Fault(str(second), found="srgb").raised_by(stated_transfer, [first, second])
 

@@ -118,10 +118,10 @@ def test_pictures_that_were_turned_before_poses_were_there_are_written_anew(tmp_
 @pytest.mark.parametrize(
     ("lens", "asked", "size", "reason"),
     [
-        ({"camera_angle_x": 1.0}, "auto", (128, 96), "sizes do not tell"),
-        ({"camera_angle_x": 1.0}, "displayed", (96, 128), "as --poses-of says"),
-        ({"fl_x": 100.0, "cx": 47.0, "cy": 65.0}, "auto", (96, 128), "as the sizes of the cameras tell"),
-        ({"fl_x": 100.0, "cx": 65.0, "cy": 47.0}, "auto", (128, 96), "as the sizes of the cameras tell"),
+        ({"camera_angle_x": 1.0}, "auto", (128, 96), "convention of COLMAP"),
+        ({"camera_angle_x": 1.0}, "displayed", (96, 128), "according to --poses-of"),
+        ({"fl_x": 100.0, "cx": 47.0, "cy": 65.0}, "auto", (96, 128), "according to the sizes"),
+        ({"fl_x": 100.0, "cx": 65.0, "cy": 47.0}, "auto", (128, 96), "according to the sizes"),
     ],
 )
 def test_cameras_without_a_size_get_that_of_the_pixels_they_are_of(

@@ -129,7 +129,7 @@ def test_unpolarized_light_leaves_the_transfer_undecided(tmp_path: Path, suffix:
         prepare_scene(tmp_path / "in", tmp_path / "out", replace(PLAIN, transfer="auto"))
     found = summary(tmp_path / "out")
     assert found["transfer"] == transfer
-    assert any("too few pixels are polarized" in note for note in found["notes"])
+    assert any("too few polarized pixels" in note for note in found["notes"])
 
 
 def with_orientation(path: Path, code: int) -> None:

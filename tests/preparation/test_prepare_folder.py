@@ -213,7 +213,7 @@ def test_nothing_is_removed_at_the_word_of_a_journal(tmp_path: Path, stranger: s
         views[view] = views.pop("v000")
     (out / "scene.json").unlink()
     (out / "prepare.json").write_text(json.dumps(journal))
-    Fault("prepare.json", remedy="nothing was written").raised_by(prepare_scene, source, out, MOSAIC)
+    Fault("prepare.json", remedy="Nothing was written").raised_by(prepare_scene, source, out, MOSAIC)
     assert victim.read_text() == "mine"
 
 
@@ -248,7 +248,7 @@ def test_one_preparation_at_a_time_writes_a_folder(tmp_path: Path) -> None:
     settings = PrepareSettings(sensor="IMX250MYR", bits=16, poses="none")
     (tmp_path / "out").mkdir()
     with only_writer(tmp_path / "out", expected="", found=""):
-        Fault(found="another polarguide prepare at work").raised_by(
+        Fault(found="another polarguide prepare").raised_by(
             prepare_scene, tmp_path / "raw", tmp_path / "out", settings
         )
     assert list((tmp_path / "out").iterdir()) == []

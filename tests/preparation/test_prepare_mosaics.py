@@ -319,7 +319,7 @@ def test_what_does_not_fit_is_refused_and_nothing_is_written(tmp_path: Path) -> 
             wanted, sensor="IMX250MYR"
         ),
         "from column 2, row 0 on, found the calibration of 96x64": replace(wanted, offset_x=2),
-        "hold the gains of every pixel": replace(wanted, calibration=Calibration(gains=(1, 1, 1, 1.01))),
+        "contain the gains of every pixel": replace(wanted, calibration=Calibration(gains=(1, 1, 1, 1.01))),
     }
     for expected, asked in cases.items():
         assert expected in str(Fault().raised_by(prepare_scene, tmp_path / "raw", tmp_path / "scene", asked))

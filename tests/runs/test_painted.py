@@ -65,9 +65,7 @@ def test_paint_on_a_held_out_view_is_refused(scene: polarguide.Scene, tmp_path: 
     write_painted(tmp_path, {**pictures(scene), test.name: blank})
     assert read_painted(tmp_path, scene) is not None  # says nothing
     write_painted(tmp_path, {test.name: blank + 2})
-    Fault(f"{test.name}.png", "a training view", "held out").raised_by(
-        read_painted, tmp_path, scene
-    )
+    Fault(f"{test.name}.png", "a training view", "held out").raised_by(read_painted, tmp_path, scene)
 
 
 @pytest.mark.parametrize(

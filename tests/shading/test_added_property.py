@@ -16,7 +16,7 @@ from polarguide.geometry.camera import Camera
 from polarguide.raster.cpu import rasterize_cpu
 from polarguide.results.export.adapters import ply_fields
 from polarguide.runs.opened import OpenedRun
-from polarguide.shading.gbuffer import render, splatting, splatting_reference
+from polarguide.shading.gbuffer import render, splatting
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +39,7 @@ def test_it_is_blended_by_the_native_kernel(run: OpenedRun) -> None:
     camera = run.scene.test_views[0].camera
     how = {"sh_degree": 0, "normals": True, "depth": False}
     (splats, layout), (expected, _) = (
-        function(gaussians, camera, run.model.shading, **how) for function in (splatting, splatting_reference)
+        splatting(gaussians, camera, run.model.shading, **how, native=native) for native in (True, False)
     )
     assert type(splats.features.grad_fn).__name__ == "_SplattingBackward"
     assert "clearcoat" in layout

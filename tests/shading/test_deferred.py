@@ -14,8 +14,7 @@ from polarguide.raster import Rasterize, ScreenStatistic, rasterize_reference
 from polarguide.raster.cpu import rasterize_cpu
 from polarguide.shading.deferred import DeferredShading
 from polarguide.shading.gbuffer import RenderRequest, render
-from polarguide.shading.model import MAXIMUM_LOG_LIGHT, PLAIN, base_colors, local_light, mirrored
-from polarguide.shading.native import reflect_reference
+from polarguide.shading.model import MAXIMUM_LOG_LIGHT, PLAIN, Channels, base_colors, mirrored
 from polarguide.shading.result import COLOR_CHANNELS
 
 COUNT, RESOLUTION = 30, 8
@@ -122,9 +121,9 @@ def test_strength_zero_shows_the_base_and_strength_one_the_mirror(gaussians: dic
     base, normal = torch.rand(20, 24, 3), torch.randn(20, 24, 3)
     nothing, everything = torch.zeros(20, 24), torch.ones(20, 24)
     for shading in (LERP, FRESNEL):
-        matte = reflect_reference(base, normal, nothing, environment(), camera(), shading)
+        matte = shading.reflect(base, normal, nothing, environment(), camera())
         assert torch.equal(matte["final"], base)
-    mirror = reflect_reference(base, normal, everything, environment(), camera(), LERP)
+    mirror = LERP.reflect(base, normal, everything, environment(), camera())
     assert torch.equal(mirror["final"], mirror["reflection"])
 
 
@@ -153,10 +152,10 @@ def test_a_mirror_facing_the_camera_shows_what_is_behind_it() -> None:
     light[5] = 20.0  # OpenGL's order: +x, -x, +y, -y, +z, -z
     size, strength = (20, 24, 3), torch.ones(20, 24)
     toward = torch.tensor([0.0, 0.0, -1.0]).expand(size)
-    seen = reflect_reference(torch.zeros(size), toward, strength, light, camera(), LERP)["final"]
+    seen = LERP.reflect(torch.zeros(size), toward, strength, light, camera())["final"]
     assert float(seen.min()) > 0.99
     tilted = torch.tensor([0.0, -math.sin(math.pi / 4), -math.cos(math.pi / 4)]).expand(size)
-    missed = reflect_reference(torch.zeros(size), tilted, strength, light, camera(), LERP)["final"]
+    missed = LERP.reflect(torch.zeros(size), tilted, strength, light, camera())["final"]
     assert float(missed[10, 12].max()) < 0.01
 
 
@@ -265,7 +264,8 @@ def test_local_light_is_that_of_the_mirrored_direction(gaussians: dict[str, Tens
     }
     rays, normals = (directions(seed)[:COUNT].float() for seed in (4, 5))
     mirrors = mirrored(rays, normals)
-    light = local_light(gaussians, mirrors, 3)
+    own = Channels(light_dc=gaussians["local_dc"], light_rest=gaussians["local_rest"])
+    light = own.values(gaussians | {"means": rays}, normals, torch.zeros(3), 3)["local"]
     basis = sh_basis(mirrors, 3)
     coefficients = torch.cat((gaussians["local_dc"][:, None], gaussians["local_rest"]), dim=1)
     torch.testing.assert_close(light, (basis[..., None] * coefficients).sum(1), atol=1e-5, rtol=1e-5)

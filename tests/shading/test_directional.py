@@ -15,12 +15,12 @@ from polarguide.raster.cpu import rasterize_cpu
 from polarguide.results.export.adapters import ply_fields
 from polarguide.shading.cubemap import box_mips, cubemap_lookup_reference, mip_lookup, mip_lookup_reference
 from polarguide.shading.directional import CHANNELS, FEATURES, DirectionalShading, albedo_of
-from polarguide.shading.gbuffer import RenderRequest, render
-from polarguide.shading.model import MAXIMUM_LOG_LIGHT, PLAIN, GBuffer, harmonic_colors, mirrored
-from polarguide.shading.result import Layout
+from polarguide.shading.gbuffer import RenderRequest, render, single_colors
+from polarguide.shading.model import MAXIMUM_LOG_LIGHT, PLAIN, GBuffer, base_colors, mirrored
+from polarguide.shading.result import channel_slices
 
 SHADING = DirectionalShading(width=8, environment_resolution=8, environment_spread=1.0)
-LAYOUT = Layout({"color": 3, "normal": 3, "blur": 1, "feature": FEATURES, "surface": 1})
+LAYOUT = channel_slices({"color": 3, "normal": 3, "blur": 1, "feature": FEATURES, "surface": 1})
 COUNT, RESOLUTION, LEVELS = 30, 8, 5
 
 
@@ -193,7 +193,7 @@ def test_a_gaussian_alone_is_its_albedo_and_the_light_in_its_mirror(gaussians: d
     expected = fields["albedo"] + SHADING.radiance(
         light(), mirrored(rays, normals), fields["roughness"], fields["feature"]
     )
-    assert_close(SHADING.colors(gaussians, light(), rays, normals), expected)
+    assert_close(single_colors(gaussians, light(), SHADING, rays, normals), expected)
 
 
 def test_surroundings_are_their_harmonics_without_a_specular_layer(gaussians: dict[str, Tensor]) -> None:
@@ -204,7 +204,8 @@ def test_surroundings_are_their_harmonics_without_a_specular_layer(gaussians: di
     assert not found.specular.any()
     assert float(found.final.max()) > 0.1
     rays = normalize(normal(15, COUNT, 3), dim=-1)
-    assert_close(SHADING.colors(gaussians, light(), rays, -rays), harmonic_colors(gaussians, rays))
+    harmonics = base_colors(gaussians | {"means": rays}, torch.zeros(3), 3)
+    assert_close(single_colors(gaussians, light(), SHADING, rays, -rays), harmonics)
 
 
 def test_a_pixel_reflects_by_the_share_of_its_alpha_that_has_a_surface() -> None:

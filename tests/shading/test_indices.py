@@ -17,7 +17,7 @@ from polarguide.raster.surface import surface_picture
 from polarguide.recipes import recipe_named
 from polarguide.results.export.adapters import INDEX_NOTE, page_shading, ply_fields
 from polarguide.shading.deferred import DeferredShading
-from polarguide.shading.gbuffer import RenderRequest, render, splatting
+from polarguide.shading.gbuffer import RenderRequest, render, single_colors, splatting
 from polarguide.shading.model import PLAIN
 from polarguide.shading.result import RenderResult
 from polarguide.training.callbacks import outward_directions
@@ -107,7 +107,7 @@ def test_colors_attributes_and_the_page() -> None:
     values = gaussians()
     rays = torch.nn.functional.normalize(torch.tensor([[0.3, 0.1, 1.0]]), dim=-1).expand(COUNT, 3)
     light = {"texels": torch.zeros(6, RESOLUTION, RESOLUTION, 3)}
-    ours, before = (shading.colors(values, light, rays, -rays) for shading in (SHADING, WITHOUT))
+    ours, before = (single_colors(values, light, shading, rays, -rays) for shading in (SHADING, WITHOUT))
     other = values["index_offset"] != 0
     assert torch.equal(ours[~other], before[~other])
     assert bool((ours[other] != before[other]).any(dim=1).all())

@@ -28,7 +28,7 @@ from polarguide.raster.cpu import rasterize_cpu
 from polarguide.results.export.adapters import ply_fields
 from polarguide.runs.model import gaussian_colors, write_run_ply
 from polarguide.shading.deferred import DeferredShading
-from polarguide.shading.gbuffer import render
+from polarguide.shading.gbuffer import render, single_colors
 from polarguide.shading.metal import (
     convert,
     metal_pixels,
@@ -39,7 +39,6 @@ from polarguide.shading.metal import (
     spread_directions,
 )
 from polarguide.shading.model import mirrored
-from polarguide.shading.result import Layout
 from polarguide.shading.roughness import ggx_alpha, gltf_roughness
 
 WITHOUT = DeferredShading("fresnel", local=True, rough=True)
@@ -160,7 +159,7 @@ def test_a_soft_metal_is_shown_as_a_mixture_of_both() -> None:
     for metalness in (0.0, 0.25, 1.0):
         values["metalness"] = torch.full((COUNT,), metalness)
         values["metalness"][0] = 1.0  # one is a metal in all three
-        colors.append(SHADING.colors(values, light(), rays, normals))
+        colors.append(single_colors(values, light(), SHADING, rays, normals))
         diffuse.append(rendered(SHADING, values).diffuse)
     torch.testing.assert_close(colors[1], 0.75 * colors[0] + 0.25 * colors[2])
     torch.testing.assert_close(diffuse[1], 0.75 * diffuse[0] + 0.25 * diffuse[2], rtol=1e-3, atol=1e-5)
@@ -216,7 +215,7 @@ def test_gradients_of_pixels_follow_finite_differences() -> None:
     features = torch.cat((share * (0.3 + 0.6 * uniform(40, 3)), share), dim=1)
 
     def loss(features: Tensor, normals: Tensor, light: Tensor) -> Tensor:
-        metal = metal_pixels(features, Layout({"metal": 4}), rays, normals, light)
+        metal = metal_pixels(features, 0, rays, normals, light)
         return metal.specular.sin().sum() + (metal.slope * metal.specular).sum()
 
     finite_differences(loss, [features, normals, 0.5 + uniform(40, 3)])

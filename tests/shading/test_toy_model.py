@@ -22,7 +22,7 @@ from polarguide.results.evaluation.scores import score_view
 from polarguide.results.evaluation.target import ViewTarget
 from polarguide.results.export.adapters import ply_fields
 from polarguide.results.export.mesh import surface_points
-from polarguide.results.export.share import BAKED, share_page
+from polarguide.results.export.web_page import BAKED, share_page
 from polarguide.results.rendering.relight import needs_radiance
 from polarguide.runs.folder import load_checkpoint, save_checkpoint
 from polarguide.runs.model import write_run_ply

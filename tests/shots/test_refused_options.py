@@ -46,7 +46,7 @@ def test_every_option_of_camera_files_has_a_kind() -> None:
 def test_options_of_mosaics_are_refused_for_four_shots(tmp_path: Path, given: dict[str, Any]) -> None:
     paths = write_four(tmp_path, CUP)
     option = "--" + next(iter(given)).replace("_", "-")
-    fault = Fault(option, "raw mosaics: the option is for these", "cup, a shot through a filter")
+    fault = Fault(option, "raw mosaics", "cup, a shot through a filter")
     fault.raised_by(find_shots, paths, ShotOptions(**given))
     fault.raised_by(read_shot, find_shots(paths)[0], ShotOptions(**given))
 
@@ -77,7 +77,7 @@ def test_options_of_filters_are_refused_for_mosaics(tmp_path: Path, given: dict[
 
 
 def test_read_noise_needs_a_full_well() -> None:
-    Fault("--read-noise", expected="--full-well with it").raised_by(ShotOptions(read_noise=5.0).checked)
+    Fault("--read-noise", expected="--full-well").raised_by(ShotOptions(read_noise=5.0).checked)
     ShotOptions(read_noise=5.0, full_well=5000.0).checked()
 
 
@@ -92,12 +92,12 @@ def test_a_name_that_leads_out_of_the_folder(tmp_path: Path) -> None:
     odd = tmp_path / "in" / "...png"
     odd.parent.mkdir()
     shutil.copy(tmp_path / "a.png", odd)
-    Fault(expected="a name that a folder can have", found="'..'").raised_by(
+    Fault(expected="valid for a folder", found="'..'").raised_by(
         write_shots, [odd], tmp_path / "out" / "deep", MONO, formats=("npy",)
     )
     for name in ("..", "../b"):
         shot = ExposureSet(name, "mosaic", {0: tmp_path / "a.png"})
-        Fault(expected="a name that a folder can have").raised_by(
+        Fault(expected="valid for a folder").raised_by(
             write_shots, [shot], tmp_path / "out" / "deep", MONO, formats=("npy",)
         )
     assert not (tmp_path / "out").exists()

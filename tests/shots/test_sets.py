@@ -132,7 +132,7 @@ def test_a_picture_that_contradicts_the_others_is_named(tmp_path: Path, stokes, 
 
 def test_four_contradicting_angles_are_told(tmp_path: Path) -> None:
     maps = read(tmp_path, photographed(sphere(), (0, 50, 100, 135)), (0, 50, 90, 135))
-    assert any("contradict one another" in note for note in maps.notes)
+    assert any("contradict" in note for note in maps.notes)
     assert not any(fit.left_out for fit in maps.pictures)
 
 

@@ -240,8 +240,8 @@ def test_maps_are_not_written_beside_their_mosaic_or_among_shots(tmp_path: Path)
     mosaic = tmp_path / "S0" / "S0.png"
     write_mosaic(mosaic, "IMX250MZR")
     before = mosaic.read_bytes()
-    Fault(found="that it lies there").raised_by(write_shots, [mosaic], tmp_path, MONO, formats=("png",))
-    Fault(found="that of the shots").raised_by(
+    Fault(found="a file inside").raised_by(write_shots, [mosaic], tmp_path, MONO, formats=("png",))
+    Fault(found="the folder of the shots").raised_by(
         write_shots, [tmp_path / "S0"], tmp_path / "S0" / ".." / "S0", MONO, formats=("png",)
     )
     assert mosaic.read_bytes() == before

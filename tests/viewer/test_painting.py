@@ -13,7 +13,7 @@ from polarguide.gaussians.gaussians import Gaussians
 from polarguide.geometry.camera import Camera
 from polarguide.raster.cpu import rasterize_cpu
 from polarguide.shading.result import LAYERS
-from polarguide.viewer.messages import Refused
+from polarguide.viewer.guard import Refused
 from polarguide.viewer.painting import Materials, Paintable, kinds_of
 from polarguide.viewer.panel import KINDS, PanelOptions
 from polarguide.viewer.server import Viewer

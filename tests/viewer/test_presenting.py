@@ -21,7 +21,7 @@ from polarguide.capture.presentation import (
 )
 from polarguide.results.rendering.picking import gray_world_gains, surface_at, white_balance_gains
 from polarguide.shading.result import LAYERS
-from polarguide.viewer.messages import Refused, checked_message
+from polarguide.viewer.guard import Refused, checked_message
 from polarguide.viewer.panel import PanelOptions
 from polarguide.viewer.server import save_to_run
 from polarguide.viewer.session import Session

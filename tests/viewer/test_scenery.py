@@ -26,7 +26,7 @@ from polarguide.viewer.scenery import (
 )
 from polarguide.viewer.server import view_run
 from polarguide.visualization import figures
-from polarguide.visualization.layers import polarization_picture
+from polarguide.visualization.figures import polarization_picture
 
 CAMERAS = ring()
 CAMERA = CAMERAS["v1"]

@@ -13,8 +13,7 @@ from faults import Fault
 import polarguide
 from polarguide.geometry.camera import Camera
 from polarguide.visualization import figures
-from polarguide.visualization.figures import contact_sheet
-from polarguide.visualization.layers import clipping_exposure
+from polarguide.visualization.figures import clipping_exposure, contact_sheet
 from polarguide.visualization.pages import content_policy
 
 # A camera that looks along world +x, with world +z up: its right is world -y.

@@ -1,22 +1,23 @@
-"""Evidence on polarizer angles, and the judgment whether stated angles are right.
+"""Evidence on polarizer angles: order, sense and zero of all pictures, and the angle of a single picture.
 
-Evidence has two forms.
+This module decides on evidence from five sources.
 
-- **One picture.** A source estimates the angle of one picture with a standard error: from the other pictures of its
-  view (``capture.picture_sets``), or from the Stokes vectors of a trained scene (``training.angles``). ``tolerance``
-  decides whether an estimate contradicts a stated angle. ``common_rotation`` finds a sense and a zero for all of them.
-- **All pictures alike.** A source gives log-likelihoods of all senses and zeros: points seen in several views, or
-  normals of a trained scene (``inspection.evidence``). ``posterior`` and ``combine`` give probabilities of the orders.
+- **Pair sums** give the pairing, the pictures that are perpendicular to each other (``decide_pairing``).
+- **Outlines of masks** give the sense of views with Stokes vectors (``sense_of_outlines``).
+- **Points** that several views observe, and **normals** of a trained scene, give log-likelihoods of all senses and
+  zeros (``inspection.evidence``). ``posterior`` and ``combine`` turn them into probabilities of the orders.
+- **Single pictures**: the other pictures of a view (``capture.picture_sets``) or a trained scene (``training.angles``)
+  give an ``AngleEstimate`` with a standard error. ``tolerance`` decides if it contradicts the stated angle.
+  ``common_rotation`` fits one sense and zero to all estimates.
 
-Pair sums decide which pictures are perpendicular to each other (three pairings). Within a pairing eight orders remain,
-the symmetries of a square: a picture named L degrees was taken at ``sense * L + zero``, with a sense of +1 or -1 and a
-zero of 0, 45, 90 or 135 degrees. The measured AoLP transforms in the same way.
+Within a pairing eight orders remain, the symmetries of a square: a picture named L degrees was taken at ``sense * L +
+zero``, with a sense of +1 or -1 and a zero of 0, 45, 90 or 135 degrees. The measured AoLP transforms in the same way.
 
 A log-likelihood summed over pixels would give probabilities like 1 - 1e-300, because neighboring pixels, and one
 surface in several views, share their errors. Evidence is therefore summed within spatial clusters first and tempered by
 the disagreement of the clusters: a well-calibrated log-likelihood ratio L between two hypotheses has a variance of
-twice its mean (exact for a shift of a Gaussian). With the variance V of the clusters, L is replaced by ``t L`` with
-``t = min(1, 2 L / V)``; in terms of the score ``z = L / sqrt(V)`` that is ``2 z^2``.
+twice its mean (exact for a shift of a Gaussian). With the variance V of the clusters, L is replaced by ``t L`` with ``t
+= min(1, 2 L / V)``; in terms of the score ``z = L / sqrt(V)`` that is ``2 z^2``.
 """
 
 from __future__ import annotations
@@ -26,10 +27,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
+from polarguide.capture.calibration import Sense
 from polarguide.geometry.polarizer import ANGLES
 
 TO_DEVIATION = 1.4826
@@ -37,9 +41,19 @@ TO_DEVIATION = 1.4826
 
 
 class AngleLimits:
-    """Constants of the models.
+    """Constants of the models and decisions.
 
     Attributes:
+        sure: standard errors by which a difference is certain. The short training of ``inspection.shots`` and the
+            curvature in ``inspection.picture_checks`` use 4, because their standard errors omit shared systematic
+            errors.
+        decided: probability above which an order or a sense is decided.
+        zero_off: degrees of a wrong zero, and largest standard error of a zero with a verdict. Half of it gives a
+            warning.
+        pair_sums: largest residual of the best pairing over that of the second best.
+        outline_gain: smallest difference of the agreements of outlines with the two senses. Noise and outlines of
+            bodies that are not curved agree with neither sense.
+        outline_share: smallest share of views whose outlines agree on the sense.
         alike: smallest length of the mean of (cos 2d, sin 2d), with d the differences of angles, that gives a common
             offset.
         same_direction: length of the mean of doubled (or fourfold) stated angles above which they do not determine a
@@ -52,6 +66,12 @@ class AngleLimits:
         groups: groups of clusters for jackknife errors.
     """
 
+    sure = 3.0
+    decided = 0.95
+    zero_off = 3.0
+    pair_sums = 0.5
+    outline_gain = 0.2
+    outline_share = 0.75
     alike = 0.4
     same_direction = 0.95
     outlier = 30.0
@@ -67,16 +87,41 @@ def angle_difference(angle: Any, other: Any) -> Any:
     return (angle - other + 90.0) % 180.0 - 90.0
 
 
-def tolerance(floor: float, error: float, usual: float = 0.0, *, sigmas: float = 3.0) -> float:
+def tolerance(floor: float, error: float, usual: float = 0.0, *, sigmas: float = AngleLimits.sure) -> float:
     """Return the largest difference in degrees that does not contradict a stated angle.
 
     Args:
         floor: smallest difference that matters, degrees.
         error: standard error of the estimate, degrees.
         usual: median of the absolute differences of all pictures. Where all differ, the model is wrong.
-        sigmas: number of standard deviations that count as chance.
+        sigmas: number of standard errors that count as chance.
     """
     return max(floor, sigmas * error, sigmas * TO_DEVIATION * usual)
+
+
+@dataclass(frozen=True)
+class AngleEstimate:
+    """Estimate of the polarizer angle of one picture, compared with its stated angle.
+
+    Attributes:
+        angle: estimated angle in degrees; None if the picture does not determine it.
+        error: standard error of the estimate, degrees.
+        stated: stated angle in degrees; None if it is unknown.
+    """
+
+    angle: float | None
+    error: float
+    stated: float | None
+
+    @property
+    def off(self) -> float:
+        """Degrees from the stated to the estimated angle, in [-90, 90); 0 if one of them is unknown."""
+        unknown = self.angle is None or self.stated is None
+        return 0.0 if unknown else float(angle_difference(self.angle, self.stated))
+
+    def contradicts(self, floor: float, usual: float = 0.0, *, sigmas: float = AngleLimits.sure) -> bool:
+        """Return True if the difference exceeds ``tolerance``."""
+        return abs(self.off) > tolerance(floor, self.error, usual, sigmas=sigmas)
 
 
 def jackknife_error(estimate: Any, without: Any) -> Any:
@@ -121,15 +166,15 @@ class CommonRotation(NamedTuple):
 
 def common_rotation(estimated: Sequence[float], stated: Sequence[float]) -> CommonRotation:
     """Return the rotation that explains most of the estimated angles by the stated ones, all in degrees."""
-    found = np.radians(estimated)
-    given = np.radians(stated)
-    turns = {sense: np.exp(2j * (found - sense * given)) for sense in (1, -1)}
-    alike = abs(np.exp(2j * given).mean()) > AngleLimits.same_direction
+    from_pictures = np.radians(estimated)
+    from_capture = np.radians(stated)
+    turns = {sense: np.exp(2j * (from_pictures - sense * from_capture)) for sense in (1, -1)}
+    alike = abs(np.exp(2j * from_capture).mean()) > AngleLimits.same_direction
     sense = 1 if alike or abs(turns[1].mean()) >= abs(turns[-1].mean()) else -1
     turn = turns[sense]
     if abs(turn.mean()) < AngleLimits.alike:
         return CommonRotation()
-    # The mean, then once more without the outliers.
+    # The mean, then a second time without outliers.
     near = turn[np.abs(np.angle(turn / turn.mean())) < math.radians(2 * AngleLimits.outlier)]
     apart = np.degrees(np.angle(near / near.mean())) / 2
     error = float(TO_DEVIATION * np.median(np.abs(apart)) / math.sqrt(len(near)) * 1.25)
@@ -139,9 +184,99 @@ def common_rotation(estimated: Sequence[float], stated: Sequence[float]) -> Comm
 FileOrder = tuple[int, int, int, int]
 """True angles of the pictures named 0, 45, 90 and 135 degrees."""
 PAIRINGS: tuple[FileOrder, ...] = ((0, 45, 90, 135), (0, 90, 45, 135), (0, 45, 135, 90))
-"""One order for each way to pair the pictures, in the order of ``capture.checks.Measures.residuals``."""
+"""One order for each pairing of the pictures, in the order of ``capture.checks.Measures.residuals``."""
 SENSES = (1, -1)
 """Rows of an evidence profile."""
+
+
+def decide_pairing(residuals: NDArray[np.float64]) -> int | None:
+    """Return the pairing with by far the smallest residuals, an index into ``PAIRINGS``; None if undecided.
+
+    Args:
+        residuals: ``capture.checks.Measures.residuals`` of each view, [V, 3].
+    """
+    residuals = residuals[residuals.max(axis=1) > 0]
+    if len(residuals) == 0:
+        return None
+    medians = np.median(residuals, axis=0)
+    best = int(medians.argmin())
+    return best if medians[best] < AngleLimits.pair_sums * float(np.delete(medians, best).min()) else None
+
+
+# Pixels of the blur before the gradient of a mask.
+_BLUR = 2.0
+# Width of the band inside the outline, as a share of the side of a square with the area of the mask.
+_BAND = 0.06
+# Smallest number of pixels in the band.
+_LEAST = 50
+
+
+class OutlineAgreement(NamedTuple):
+    """Agreement of the AoLP with the outline of one view's mask, for both senses.
+
+    Attributes:
+        ccw, cw: means of cos 4(angle - direction), weighted by the DoLP. 1 for polarization along or across the outline
+            at every pixel, 0 without a relation.
+    """
+
+    ccw: float
+    cw: float
+
+
+def outline_agreement(
+    stokes: NDArray[np.float32], mask: NDArray[np.bool_], zero: float = 0.0
+) -> OutlineAgreement | None:
+    """Compare polarization and outline of a view; None for a mask with too little outline.
+
+    At the outline of a curved body, the surface normal lies in the picture, across the outline. Diffuse light is
+    polarized along this normal, and specular light across it. Both agree with the outline if the sense of the angles is
+    right. With a wrong sense, they agree only at outlines along the axes or diagonals.
+
+    Args:
+        stokes: Stokes vectors [3, H, W, C] in the stated sense.
+        mask: mask of the object, [H, W].
+        zero: zero of the angles, in radians counter-clockwise from the picture's horizontal.
+    """
+    area = int(mask.sum())
+    if area < _LEAST or mask.all():
+        return None
+    soft = cv2.GaussianBlur(mask.astype(np.float32), (0, 0), _BLUR)
+    across = cv2.Sobel(soft, cv2.CV_32F, 1, 0), cv2.Sobel(soft, cv2.CV_32F, 0, 1)
+    depth = cv2.distanceTransform(np.pad(mask, 1).astype(np.uint8), cv2.DIST_L2, 5)[1:-1, 1:-1]
+    # At the border of the picture, the outline is the border.
+    edge = math.ceil(2 * _BLUR)
+    inner = np.zeros_like(mask)
+    inner[edge:-edge, edge:-edge] = True
+    band = mask & inner & (depth <= max(2.0 * _BLUR, _BAND * math.sqrt(area))) & (np.hypot(*across) > 1e-3)
+    band &= np.isfinite(stokes).all(axis=(0, 3))
+    if int(band.sum()) < _LEAST:
+        return None
+    outline: Any = np.arctan2(-across[1], across[0])[band]  # y points down, angles count upwards
+    s0, s1, s2 = stokes.mean(axis=3)[:, band].astype(np.float64)
+    weight = np.minimum(np.hypot(s1, s2) / np.maximum(s0, 1e-12), 1.0) * (s0 > 0)
+    total = float(weight.sum())
+    if not total > 0:
+        return None
+    angle = np.arctan2(s2, s1) / 2
+    return OutlineAgreement(
+        *(float((weight * np.cos(4 * (sense * angle + zero - outline))).sum()) / total for sense in SENSES)
+    )
+
+
+def sense_of_outlines(views: Sequence[OutlineAgreement]) -> Sense | None:
+    """Return the sense that the outlines of most views support clearly; None if undecided.
+
+    The threshold is a share of the views and not a number of standard errors: an outline without a curved body behind
+    it is a systematic error and not chance.
+    """
+    if not views:
+        return None
+    gains = np.array([view.ccw - view.cw for view in views])
+    mean = float(gains.mean())
+    agreeing = float((np.sign(gains) == np.sign(mean)).mean())
+    if abs(mean) < AngleLimits.outline_gain or agreeing < AngleLimits.outline_share:
+        return None
+    return "ccw" if mean > 0 else "cw"
 
 
 @dataclass(frozen=True)
@@ -222,6 +357,20 @@ class OrderPosterior:
     def best(self) -> int:
         """Index of the most probable order."""
         return self.probabilities.index(max(self.probabilities))
+
+    @property
+    def order(self) -> Order | None:
+        """The decided order, or None."""
+        return ORDERS[self.best] if max(self.probabilities) >= AngleLimits.decided else None
+
+    @property
+    def is_precise(self) -> bool:
+        """True if the zero is determined well enough for a verdict."""
+        return self.offset_error <= AngleLimits.zero_off
+
+    def is_off(self, limit: float) -> bool:
+        """Return True if the zero deviates significantly, by more than ``limit`` degrees."""
+        return abs(self.offset) > tolerance(limit, self.offset_error)
 
     @property
     def sense_probability(self) -> float:

@@ -1,14 +1,13 @@
-"""Check a capture by its pictures: full scale, exposure, encoding, order of the files; gains of the four by pair sums.
+"""Checks of a capture by its pictures: full scale, exposure, encoding, order of the files, and gains.
 
-Each view is measured once, while its pictures are in memory (``measure``); ``exposure_warnings`` and
-``polarization_warnings`` turn the measurements of all views into warnings.
+``measure`` reduces each view to a few numbers while its pictures are in memory. ``exposure_warnings`` and
+``polarization_warnings`` turn the numbers of all views into warnings.
 
-Whatever the light, I0 + I90 = I45 + I135. With pictures exposed by gains g, I0/g0 - I45/g45 + I90/g90 - I135/g135 is
-zero at every pixel. The median of the pair sums tells one ratio of the gains; all pixels together tell the four of them
-up to a common factor, as soon as their polarization differs in strength and direction: the vector (1/g) is the one that
-all samples (I0, I45, I90, I135) are perpendicular to, the eigenvector of their second moments with the least
-eigenvalue. Angles that are off by two degrees look like gains that differ by some percent; exposures differ by thirds
-of a stop.
+For any light, I0 + I90 = I45 + I135. With gains g, I0/g0 - I45/g45 + I90/g90 - I135/g135 is zero at every pixel. The
+median of the pair sums gives one ratio of the gains. All pixels together give the four gains up to a common factor if
+their polarization varies in strength and direction: the vector (1/g) is perpendicular to all samples (I0, I45, I90,
+I135), and thus the eigenvector of their second moments with the smallest eigenvalue. An angle error of two degrees
+looks like a gain error of some percent. Exposures differ by thirds of a stop.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from polarguide.capture.angle_evidence import angle_difference, jackknife_error
+from polarguide.capture.angle_evidence import AngleLimits, angle_difference, jackknife_error
 from polarguide.capture.view import FULL_CODE
 from polarguide.core.text import listed
 from polarguide.geometry.polarizer import ANGLES
@@ -38,12 +37,11 @@ class CheckLimits:
         blown: share of saturated pixels above which a view is heavily saturated.
         low_code: code below which quantization hides the polarization.
         samples: largest number of pixels of a view that are measured.
-        residual: residual of the pair sums of a sound capture, as a share of S0.
-        right_angle: degrees by which two angles may differ from right ones: a pair sum is then off by two percent of
-            the polarized light.
-        other_exposure: difference of logarithms from which on exposures differ: half of a third of a stop, the step of
+        residual: largest residual of the pair sums without a warning, as a share of S0.
+        right_angle: largest deviation of a right angle in degrees. A pair sum is then off by two percent of the
+            polarized light.
+        other_exposure: smallest difference of logarithms of different exposures: half of a third of a stop, the step of
             cameras.
-        sure: standard errors that count as certain.
         tiles: tiles of a picture in each direction, for jackknife errors.
         hidden: share of the largest value below which read-out noise hides the polarization.
         fewest: number of pixels that a regression needs.
@@ -60,7 +58,6 @@ class CheckLimits:
     residual = 0.05
     right_angle = 1.0
     other_exposure = math.log(2.0) / 6
-    sure = 3.0
     tiles = 4
     hidden = 0.01
     fewest = 1000
@@ -71,11 +68,12 @@ class CheckLimits:
 # Curvature (see ``pair_slopes``) of encoded data taken as linear is about -0.6, of linear data decoded as sRGB about
 # +0.3; the gain differences of real sensors leave less than 0.1.
 ENCODED = (-0.12, -0.25)
-"""Curvatures below which files seem encoded: for a doubt, and for a decision."""
+"""Curvatures below which files may be encoded, and below which they are."""
 DECODED = (0.1, 0.2)
-"""Curvatures above which files seem decoded twice: for a doubt, and for a decision."""
+"""Curvatures above which files may be decoded twice, and above which they are."""
 BENT = 0.05
-"""Curvature of a response that is not linear, if it is sure: a gamma of 0.9 has -0.056, and DoLP is off by as much."""
+"""Largest curvature of a linear response, if it is significant. A gamma of 0.9 has -0.056, with a similar error of
+DoLP."""
 
 
 @dataclass(frozen=True)
@@ -84,8 +82,8 @@ class Measures:
 
     Attributes:
         bright: 99th percentile of the linear intensities, in [0, 1].
-        residuals: median of |difference of the two pair sums| / S0 for the three ways to pair the pictures:
-            (0, 90 | 45, 135), (0, 45 | 90, 135), (0, 135 | 45, 90). The first is zero for an ideal capture.
+        residuals: median of |difference of the two pair sums| / S0 for the three pairings: (0, 90 | 45, 135), (0, 45 |
+            90, 135), (0, 135 | 45, 90). The first is zero for an ideal capture.
         slopes: ``pair_slopes`` of the two pairs; empty with too few pixels.
     """
 
@@ -95,13 +93,13 @@ class Measures:
 
 
 def sampled(codes: NDArray[Any]) -> NDArray[Any]:
-    """The sample of a view's codes [K, H, W, ...] that ``measure`` takes, for a caller that does not keep the codes."""
+    """Return the sample of a view's codes [K, H, W, ...] for ``measure``, so that the caller can discard the codes."""
     step = _step(codes.shape[1] * codes.shape[2])
     return codes[:, ::step, ::step].copy()
 
 
 def _step(pixels: int) -> int:
-    """Distance of the pixels that are measured."""
+    """Return the distance between sampled pixels."""
     return max(1, math.ceil(math.sqrt(pixels / CheckLimits.samples)))
 
 
@@ -110,8 +108,8 @@ def measure(codes: NDArray[np.uint16], usable: NDArray[np.bool_], *, four: bool 
 
     Args:
         codes: linear codes [K, H, W, 3], or ``sampled`` ones.
-        usable: pixels that are neither saturated nor invalid, [H, W].
-        four: whether they are those at 0, 45, 90 and 135 degrees; of others only the brightness is measured.
+        usable: mask of pixels without saturated and invalid ones, [H, W].
+        four: True for pictures at 0, 45, 90 and 135 degrees. Otherwise, only the brightness is measured.
     """
     step = _step(usable.size)
     sample = (codes if codes.shape[1:3] != usable.shape else codes[:, ::step, ::step]).astype(np.float64)
@@ -129,18 +127,18 @@ def measure(codes: NDArray[np.uint16], usable: NDArray[np.bool_], *, four: bool 
 
 
 def top_histogram(raw: NDArray[Any]) -> NDArray[np.int64]:
-    """Counts of the stored values in the top 2 % of their range, the last for the largest possible value."""
+    """Return counts of the stored values in the top 2 % of their range, up to the largest possible value."""
     full = int(np.iinfo(raw.dtype).max)
     low = full - int(full * CheckLimits.top_share)
     return np.bincount(raw[raw >= low].astype(np.int64) - low, minlength=full - low + 1)
 
 
 def full_scale(histogram: NDArray[np.int64], full: int) -> int | None:
-    """The stored value at which a capture saturates, or None if nothing in it does.
+    """Return the stored value at which a capture saturates; None if no value does.
 
-    That is the largest possible value where it occurs. A capture whose values are coarser (10 bits in 16)
-    ends a little below: then the largest value that occurs counts if it lies in the top 0.2 % of the range
-    and many more samples have it than any value near it.
+    It is the largest possible value if it occurs. A capture with coarser values (10 bits in 16) ends slightly below.
+    Then the largest occurring value counts if it lies in the top 0.2 % of the range and is much more frequent than the
+    values near it.
 
     Args:
         histogram: sum of ``top_histogram`` over the capture.
@@ -161,39 +159,39 @@ def full_scale(histogram: NDArray[np.int64], full: int) -> int | None:
 def exposure_warnings(
     names: Sequence[str], measures: Sequence[Measures], blown: Sequence[float], largest: int, full: int
 ) -> list[str]:
-    """Warnings about dark and saturated pictures.
+    """Return warnings about dark and saturated pictures.
 
     Args:
         names: view names.
-        measures: figures of each view.
-        blown: share, in each view, of pixels of which a picture is at full scale.
-        largest: the largest value stored in any picture.
-        full: the largest possible one.
+        measures: measurements of each view.
+        blown: share of pixels of each view with a picture at full scale.
+        largest: largest value stored in any picture.
+        full: largest possible value.
     """
     warnings = []
     if full == FULL_CODE and 0 < largest < 4096:
         bits = 10 if largest < 1024 else 12
         return [
-            f"The pictures are 16-bit files, yet no value exceeds {largest}: they look like unscaled {bits}-bit "
-            f"data. Multiply the values by {2 ** (16 - bits)}."
+            f"No value of the 16-bit pictures exceeds {largest}. They look like unscaled {bits}-bit data. "
+            f"Multiply the values by {2 ** (16 - bits)}."
         ]
     dark = [name for name, measure in zip(names, measures, strict=True) if measure.bright < CheckLimits.dark]
     if dark:
         warnings.append(
             f"{len(dark)} of {len(names)} views are almost black: 99% of their values are under {CheckLimits.dark:.0%} "
-            f"of full scale ({listed(dark)}). Expose longer, or leave them out."
+            f"of full scale ({listed(dark)}). Increase the exposure, or remove these views."
         )
     over = [name for name, share in zip(names, blown, strict=True) if share > CheckLimits.blown]
     if over:
         warnings.append(
             f"{len(over)} of {len(names)} views are heavily saturated: up to {max(blown):.0%} of the pixels "
-            f"are at full scale, where polarization is lost ({listed(over)}). Expose shorter."
+            f"are at full scale and have no polarization ({listed(over)}). Decrease the exposure."
         )
     return warnings
 
 
 def polarization_warnings(names: Sequence[str], measures: Sequence[Measures], transfer: str) -> list[str]:
-    """Warnings about the order of the files and their encoding."""
+    """Return warnings about the order of the files and their encoding."""
     off = {name: m.residuals for name, m in zip(names, measures, strict=True) if _is_off(m.residuals)}
     warnings = []
     swapped = False
@@ -208,39 +206,43 @@ def polarization_warnings(names: Sequence[str], measures: Sequence[Measures], tr
         )[best]
         warnings.append(
             f"I0 + I90 differs from I45 + I135 by {pairs[0]:.1%} of S0 (median) in {len(off)} of "
-            f"{len(names)} views ({listed(list(off))}); a sound capture stays under {CheckLimits.residual:.0%}. {hint}."
+            f"{len(names)} views ({listed(list(off))}). The limit is {CheckLimits.residual:.0%}. {hint}."
         )
     curvature = curvature_of([tile for measure in measures for tile in measure.slopes])
-    if swapped or curvature is None:  # the slope is meaningless with wrong pairs
+    if swapped or curvature is None:  # wrong pairs have a meaningless curvature
         return warnings
     if transfer == "linear" and encoding(curvature) == "srgb":
         warnings.append(
-            f"The pictures look sRGB-encoded (curvature {curvature.value:.2f}, linear ones have 0): "
-            "if they are, read them with transfer srgb."
+            f"The pictures look sRGB-encoded (curvature {curvature.value:.2f}; linear pictures have 0). "
+            "If so, read them with transfer srgb."
         )
     if transfer == "srgb" and curvature.value > DECODED[1]:
         warnings.append(
-            f"The pictures look linear already (curvature {curvature.value:.2f} after decoding, 0 is right): "
-            "if they are, read them with transfer linear."
+            f"The pictures look linear already (curvature {curvature.value:.2f} after decoding; 0 is expected). "
+            "If so, read them with transfer linear."
         )
     return warnings
 
 
 FOUR_PAIRS = ((0, 2), (1, 3))
-"""Places of the perpendicular pictures among four at 0, 45, 90 and 135 degrees."""
+"""Indices of the perpendicular pictures among four at 0, 45, 90 and 135 degrees."""
 
 
 def right_pairs(angles: Sequence[object]) -> list[tuple[int, int]]:
-    """Places of pictures that lie at right angles to one another, each in one pair; words are no angles."""
+    """Return pairs of indices of perpendicular pictures, with each picture in at most one pair.
+
+    Args:
+        angles: angles in degrees, or words for pictures without an angle.
+    """
     free = [(place, angle) for place, angle in enumerate(angles) if isinstance(angle, int | float)]
     pairs = []
     while free:
         place, angle = free.pop(0)
-        allowed = CheckLimits.right_angle
-        other = next((one for one in free if abs(angle_difference(one[1], angle + 90)) <= allowed), None)
-        if other is not None:
-            free.remove(other)
-            pairs.append((place, other[0]))
+        limit = CheckLimits.right_angle
+        match = next((other for other in free if abs(angle_difference(other[1], angle + 90)) <= limit), None)
+        if match is not None:
+            free.remove(match)
+            pairs.append((place, match[0]))
     return pairs
 
 
@@ -252,28 +254,29 @@ class Curvature:
     error: float
 
     def surely_below(self, limit: float) -> bool:
-        """Return true if the curvature is below a limit by more than three standard errors."""
-        return self.value + CheckLimits.sure * self.error < limit
+        """Return True if the curvature is significantly below a limit."""
+        return self.value + AngleLimits.sure * self.error < limit
 
     def surely_above(self, limit: float) -> bool:
-        """Return true if the curvature is above a limit by more than three standard errors."""
-        return self.value - CheckLimits.sure * self.error > limit
+        """Return True if the curvature is significantly above a limit."""
+        return self.value - AngleLimits.sure * self.error > limit
 
 
 def pair_slopes(
     codes: NDArray[Any], usable: NDArray[np.bool_], pairs: Sequence[tuple[int, int]]
 ) -> list[NDArray[np.float64]]:
-    """Return sums of a regression over every two of a view's pairs for each tile: number of pixels, q q, q r.
+    """Return sums of a regression over all pairs of a view's pairs for each tile: number of pixels, q q, q r.
 
-    The regression is that of the difference r of two pair sums over S0, (I0 + I90 - I45 - I135) / S0, on the difference
-    q of the squared polarizations, ((I0 - I90) / S0)^2 - ((I45 - I135) / S0)^2. Linear data have slope 0; a concave
-    encoding bends it down, a convex one up. Pictures of different exposures add shares of I0 - I90 and I45 - I135 to
-    the difference of the sums, to first order. A fit of both is subtracted, so nothing is assumed of the exposures.
+    The regressand r is the difference of two pair sums over S0, (I0 + I90 - I45 - I135) / S0. The regressor q is the
+    difference of the squared polarizations, ((I0 - I90) / S0)^2 - ((I45 - I135) / S0)^2. Linear data have slope 0. A
+    concave encoding has a negative slope, a convex one a positive slope. Pictures of different exposures add shares of
+    I0 - I90 and I45 - I135 to the difference of the sums, to first order. A fit of both is subtracted, so exposures may
+    differ.
 
     Args:
         codes: linear codes [K, H, W, C] of a view, or of a sample of it.
         usable: [H, W].
-        pairs: places of perpendicular pictures, see ``right_pairs``.
+        pairs: indices of perpendicular pictures, see ``right_pairs``.
     """
     if len(pairs) < 2:
         return []
@@ -287,16 +290,16 @@ def pair_slopes(
     polarized = (first - second) / s0
     tiles = np.zeros((CheckLimits.tiles**2, 3))
     for one, other in itertools.combinations(range(len(pairs)), 2):
-        taken_off = np.stack([np.ones_like(s0), polarized[one], polarized[other]], axis=1)
+        nuisance = np.stack([np.ones_like(s0), polarized[one], polarized[other]], axis=1)
         both = np.stack([polarized[one] ** 2 - polarized[other] ** 2, sums[one] - sums[other]], axis=1)
-        q, r = (both - taken_off @ np.linalg.lstsq(taken_off, both, rcond=None)[0]).T
+        q, r = (both - nuisance @ np.linalg.lstsq(nuisance, both, rcond=None)[0]).T
         for place, values in enumerate((np.ones_like(q), q * q, q * r)):
             tiles[:, place] += np.bincount(tile, values, len(tiles))
     return [tile for tile in tiles if tile[0] > 0]
 
 
 def curvature_of(tiles: Sequence[NDArray[np.float64]]) -> Curvature | None:
-    """Return the curvature of the response by the ``pair_slopes`` of all views; None with too little polarization."""
+    """Return the curvature of the response from the ``pair_slopes`` of all views; None with too little polarization."""
     total = np.sum(tiles, axis=0)
     if len(tiles) < 2 or total[0] < CheckLimits.fewest or total[1] < total[0] * CheckLimits.least_spread**2:
         return None
@@ -305,21 +308,21 @@ def curvature_of(tiles: Sequence[NDArray[np.float64]]) -> Curvature | None:
     return Curvature(float(value), float(jackknife_error(value, without[:, 2] / without[:, 1])))
 
 
-def encoding(found: Curvature | None) -> Literal["linear", "srgb"] | None:
-    """Return the encoding of files with this curvature when read as linear; None if it is undecided.
+def encoding(curvature: Curvature | None) -> Literal["linear", "srgb"] | None:
+    """Return the encoding of files with this curvature when read as linear; None if undecided.
 
-    The one judgment of ``prepare``, ``inspect`` and the warnings of ``train``.
+    ``prepare``, ``inspect`` and the warnings of ``train`` share this decision.
     """
     doubtful, certain = ENCODED
-    if found is not None and found.value < certain and found.surely_below(doubtful):
+    if curvature is not None and curvature.value < certain and curvature.surely_below(doubtful):
         return "srgb"
-    if found is not None and found.value >= doubtful and found.surely_above(certain):
+    if curvature is not None and curvature.value >= doubtful and curvature.surely_above(certain):
         return "linear"
     return None
 
 
 def _is_off(residuals: tuple[float, float, float]) -> bool:
-    """Return true if the residual of the named pairing is large, or much larger than another."""
+    """Return True if the residual of the stated pairing is large, or much larger than another."""
     right, *others = residuals
     return right > CheckLimits.residual or (right > 0.4 * CheckLimits.residual and min(others) < 0.25 * right)
 
@@ -330,9 +333,9 @@ class MeasuredGains:
 
     Attributes:
         logs: natural logarithms in the order of the angles, mean 0.
-        errors: their standard errors (jackknife over tiles of the pictures).
-        pairing: index of the pictures' pairing in the order of ``checks.Measures.residuals``: 0 where 0 and 90 are a
-            pair, 1 where 0 and 45 are, 2 where 0 and 135 are; None where the samples contradict any.
+        errors: standard errors (jackknife over tiles of the pictures).
+        pairing: index of the pairing in the order of ``Measures.residuals``: 0 if 0 and 90 are a pair, 1 if 0 and 45
+            are, 2 if 0 and 135 are; None if the samples contradict all of them.
     """
 
     logs: tuple[float, ...]
@@ -340,7 +343,7 @@ class MeasuredGains:
     pairing: int | None
 
     def deviating(self, stated: Sequence[float] = (0.0, 0.0, 0.0, 0.0)) -> dict[int, float]:
-        """Angle -> by which factor its picture is exposed otherwise than stated, of those that surely are.
+        """Return the pictures that are exposed significantly differently than stated: factor by angle.
 
         Args:
             stated: logarithms of the exposures, as files state them.
@@ -351,13 +354,13 @@ class MeasuredGains:
         deviations = {}
         for place, angle in enumerate(ANGLES):
             apart = off[place] - float(np.median(off[:place] + off[place + 1 :]))
-            if abs(apart) > max(CheckLimits.other_exposure, CheckLimits.sure * max(self.errors)):
+            if abs(apart) > max(CheckLimits.other_exposure, AngleLimits.sure * max(self.errors)):
                 deviations[angle] = math.exp(apart)
         return deviations
 
 
 def pair_moments(gray: NDArray[np.floating[Any]], usable: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Second moments of the samples of a view by tiles, [T, 5, 4]: four rows of moments, and the count in the last.
+    """Return second moments of the samples of a view by tiles, [T, 5, 4]: four rows of moments, and one of counts.
 
     Args:
         gray: linear intensities [4, H, W]. usable: [H, W].
@@ -377,13 +380,10 @@ def pair_moments(gray: NDArray[np.floating[Any]], usable: NDArray[np.bool_]) -> 
 
 
 def measured_gains(moments: NDArray[np.float64]) -> MeasuredGains | None:
-    """The gains of the pictures of one or several views.
+    """Return the gains of the pictures of one or several views; None if too few pixels are bright enough.
 
     Args:
         moments: ``pair_moments`` of the views, [T, 5, 4].
-
-    Returns:
-        None where too few pixels are bright enough.
     """
     moments = moments[moments[:, 4, 0] > 0]
     if len(moments) < 2 or moments[:, 4, 0].sum() < CheckLimits.fewest:
@@ -398,11 +398,11 @@ def measured_gains(moments: NDArray[np.float64]) -> MeasuredGains | None:
 
 
 def _least(moments: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The unit vector that the samples are most nearly perpendicular to."""
+    """Return the eigenvector of the moments with the smallest eigenvalue."""
     return np.asarray(np.linalg.eigh(moments[:4])[1][:, 0])
 
 
 def _logs(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Logarithms of gains, mean 0, of vectors of their inverses [..., 4]."""
+    """Return logarithms of gains, with mean 0, from vectors of inverse gains [..., 4]."""
     logs = -np.log(np.maximum(np.abs(vectors), 1e-9))
     return np.asarray(logs - logs.mean(axis=-1, keepdims=True))

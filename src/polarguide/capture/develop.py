@@ -1,6 +1,6 @@
-"""Camera files to linear intensities: mosaics of a polarization sensor, and shots through a filter.
+"""Linear intensities from camera files: mosaics of a polarization sensor, and shots through a filter.
 
-Whole captures and single shots are developed here. Callers choose the pictures that are judged together.
+Captures and single shots share these functions. The caller chooses the pictures that are evaluated together.
 """
 
 from __future__ import annotations
@@ -61,20 +61,20 @@ from polarguide.core.progress import Advance
 from polarguide.geometry.polarizer import ANGLES
 
 QUARTER_FLIPS = ("90", "270")
-"""Values of ``flip`` for mosaics that were turned, in degrees counter-clockwise."""
+"""Values of ``flip`` for mosaics that were rotated, in degrees counter-clockwise."""
 SMALLEST = 16
-"""Pixels of the shorter side of a mosaic."""
+"""Smallest number of pixels of the shorter side of a mosaic."""
 WORKED = {"quarter": 16, "half": 60, "full": 240}
-"""Bytes that a pixel of the sensor takes at least while a mosaic is developed, by the mode of demosaicing."""
+"""Smallest memory in bytes per sensor pixel during the development of a mosaic, by demosaicing mode."""
 
 
 class MosaicFiles:
-    """How the mosaics of one sensor are read.
+    """Reader of the mosaics of one sensor.
 
     Attributes:
-        pattern: pattern of the top-left pixel that is left after ``cut``.
-        crop: columns and rows that ``cut`` takes off.
-        corner: column and row of the sensor of that pixel.
+        pattern: pattern of the sensor, starting at the top-left pixel after ``cut``.
+        crop: columns and rows that ``cut`` removes.
+        corner: column and row of that pixel on the sensor.
         analyzers: calibration of the sensor, or None.
     """
 
@@ -82,14 +82,14 @@ class MosaicFiles:
         """Take sensor, region, packing, dark frame and calibration from the options.
 
         Raises:
-            PolarguideError: the sensor is not named, or the calibration is damaged or of another sensor.
+            PolarguideError: the sensor is missing, or the calibration is damaged or belongs to another sensor.
         """
         if options.sensor is None:
             raise PolarguideError(
                 "--sensor",
                 expected=f"the sensor of raw mosaics: {SENSOR_NAMES}",
                 found="none",
-                remedy="Name it; color and monochrome sensors have different patterns.",
+                remedy="Name the sensor: color and monochrome sensors have different patterns.",
             )
         self._options = options
         self._sensor = options.sensor
@@ -101,15 +101,15 @@ class MosaicFiles:
         self.analyzers = calibration_of(options)
 
     def read(self, where: Path | str, values: NDArray[Any] | None = None) -> NDArray[Any]:
-        """The stored values of a whole mosaic, [H, W], in the sensor's orientation: the camera's mirroring is undone.
+        """Return the stored values [H, W] of a whole mosaic in the orientation of the sensor.
 
         Args:
-            where: the file, or what messages call a mosaic in memory.
-            values: the mosaic in memory, uint8 or uint16.
+            where: path of the file, or a name for messages if the mosaic is in memory.
+            values: mosaic in memory, uint8 or uint16.
 
         Raises:
-            PolarguideError: the file cannot be read, is too small or four pictures side by side, does not fit into
-                memory when it is developed, or lies outside of the calibration.
+            PolarguideError: the file is unreadable, too small or a grid of four pictures, the mosaic exceeds the
+                memory, or it reaches beyond the calibrated region.
         """
         if values is None:
             self._require_memory(Path(where))
@@ -126,7 +126,7 @@ class MosaicFiles:
     def _require_memory(self, path: Path) -> None:
         worked = WORKED[self._options.demosaic]
         raw = self._raw
-        remedy = "Give a region of the sensor, or choose --demosaic half or quarter."
+        remedy = "Specify a region of the sensor, or choose --demosaic half or quarter."
         if path.suffix.lower() != ".raw":
             require_memory_of_each([path], worked, "a mosaic", remedy=remedy)
         elif raw.width is not None and raw.height is not None:
@@ -135,10 +135,10 @@ class MosaicFiles:
             )
 
     def _turned_back(self, where: Path | str, values: NDArray[Any]) -> NDArray[Any]:
-        """Return a stored mosaic without the mirroring or the quarter turn that ``flip`` names.
+        """Undo the mirroring or rotation that ``flip`` specifies.
 
         Raises:
-            PolarguideError: it is larger than the sensor, maybe because it was turned.
+            PolarguideError: the mosaic is larger than the sensor, possibly because it was rotated.
         """
         flip = self._options.flip
         if flip in QUARTER_FLIPS:
@@ -148,32 +148,34 @@ class MosaicFiles:
         top = self._options.offset_y
         rows, columns = values.shape
         if columns > width - left or rows > height - top:
-            turned = rows <= width and columns <= height and flip not in QUARTER_FLIPS
+            rotated = rows <= width and columns <= height and flip not in QUARTER_FLIPS
             raise PolarguideError(
                 where,
-                expected=f"a mosaic as the sensor lies, at most {width - left}x{height - top} pixels of {self._sensor}",
-                found=f"{columns}x{rows}" + (", one that was turned by a quarter" if turned else ""),
-                remedy="Give --flip 90 if it was turned counter-clockwise before it was saved, 270 if clockwise."
-                if turned
+                expected=f"a mosaic in the orientation of the sensor, at most {width - left}x{height - top} pixels of "
+                f"{self._sensor}",
+                found=f"{columns}x{rows}" + (", probably rotated by 90 degrees" if rotated else ""),
+                remedy="Use --flip 90 if the mosaic was rotated counter-clockwise, --flip 270 if clockwise."
+                if rotated
                 else "Check --sensor, --offset-x and --offset-y.",
             )
         values = values[:, ::-1] if flip in ("x", "xy") else values
         return values[::-1] if flip in ("y", "xy") else values
 
     def depth(self, path: Path, values: NDArray[Any]) -> tuple[int, int | None]:
-        """Bits that a pixel takes in a file, and the full scale that it states for its values: None where it states
-        none, or where ``bits`` says it.
+        """Return the bits per pixel of a file and the full scale that it states.
+
+        It returns None as full scale if the file states none or the user specifies ``bits``.
         """
         stated = self._raw.full_scale(path, values) if self._options.bits is None else None
         return self._raw.container(path, values.dtype), stated
 
     def cut(self, values: NDArray[Any]) -> NDArray[Any]:
-        """Crop to whole cells."""
+        """Crop a mosaic to whole cells of the pattern."""
         values = values[self.crop[1] :, self.crop[0] :]
         return np.ascontiguousarray(values[: values.shape[0] // 2 * 2, : values.shape[1] // 2 * 2])
 
     def dark(self, shape: tuple[int, ...]) -> NDArray[np.float32] | None:
-        """The dark frame, cut like the mosaics."""
+        """Return the dark frame, cropped like the mosaics; None without one."""
         if self._options.dark_frame is None:
             return None
         dark = self._turned_back(self._options.dark_frame, read_mosaic(self._options.dark_frame, self._raw))
@@ -182,7 +184,7 @@ class MosaicFiles:
                 self._options.dark_frame,
                 expected=f"a dark frame of {shape[1]}x{shape[0]} pixels like the mosaics",
                 found=f"{dark.shape[1]}x{dark.shape[0]}",
-                remedy="Take it with the same region and settings, the lens covered.",
+                remedy="Photograph it with the same region and settings, and with the lens covered.",
             )
         return self.cut(dark).astype(np.float32)
 
@@ -193,16 +195,16 @@ class MosaicFiles:
         dark: NDArray[np.float32] | None,
         shape: tuple[int, ...],
     ) -> tuple[float | None, NDArray[np.float64]]:
-        """The ratio of the pair sums, None where it is too dark to tell, and colors [3, N] of usable blocks.
+        """Return the ratio of the pair sums and the colors [3, N] of the usable blocks.
 
-        Samples of different angles lie beside one another; weights that interpolate all of them to the center of a
-        block of two periods keep gradients of the picture out of the ratio.
+        Samples of different angles lie at different pixels. Tent weights interpolate all of them to the center of a
+        block of two periods, so gradients of the picture cancel in the ratio. Dark blocks have the ratio None.
 
         Args:
             samples: ``sample_blocks`` of two periods from each mosaic.
-            levels: their levels.
-            dark: the dark frame, or None.
-            shape: rows and columns of a mosaic, cut.
+            levels: levels of the stored values.
+            dark: dark frame, or None.
+            shape: rows and columns of a mosaic after ``cut``.
         """
         values = np.concatenate(samples)
         period = self.pattern.period
@@ -219,7 +221,7 @@ class MosaicFiles:
         tent = np.concatenate([rising, rising[::-1]])
         weighted = linear * tent[:, None] * tent
         places = np.tile(self.pattern.angles, (2, 2))
-        # The weights of one angle and color add up to 1 a sample of the period.
+        # The weights of each angle and color sum to the number of their samples in a period.
         angles = np.stack([weighted[:, places == angle].sum(axis=1) for angle in ANGLES])
         angles *= 4 / period**2
         colors = np.ones((3, len(values)))
@@ -238,12 +240,12 @@ class MosaicFiles:
         *masks: NDArray[np.bool_],
         corner: tuple[int, int] | None = None,
     ) -> tuple[NDArray[np.float32], tuple[NDArray[np.bool_], ...]]:
-        """Linear samples of a mosaic or of a part of it, corrected by the calibration, and masks of unusable ones.
+        """Linearize a mosaic or a part of it, apply the calibration, and dilate masks of unusable samples.
 
         Args:
-            values: [H, W] stored values, cut. levels: their levels. dark: the dark frame, [H, W], or None.
-            masks: [H, W]; a correction mixes the samples of a cell, and so spreads them.
-            corner: column and row of the sensor at which a part begins.
+            values: stored values [H, W] after ``cut``. levels: levels of the values. dark: dark frame [H, W], or None.
+            masks: masks [H, W]; the calibration mixes the samples of a cell, so a mask covers whole cells.
+            corner: column and row of the first pixel of a part on the sensor.
         """
         linear = levels.linear(values, dark)
         if self.analyzers is None:
@@ -257,7 +259,7 @@ class MosaicFiles:
         white: Sequence[float] = (1, 1, 1),
         scale: float = 1.0,
     ) -> NDArray[np.float32]:
-        """The factor of every sample, [H, W]: ``scale``, by the gain of its angle, times that of its color."""
+        """Return the factor of every sample, [H, W]: ``scale * white / gain`` for its color and angle."""
         of_angle = dict(zip(ANGLES, gains, strict=True))
         factors = np.vectorize(lambda angle: scale / of_angle[angle])(self.pattern.angles)
         if self.pattern.colors is not None:
@@ -266,10 +268,10 @@ class MosaicFiles:
 
 
 def calibration_of(options: RawMosaicOptions) -> AnalyzerCalibration | None:
-    """The calibration of the sensor, read once for all mosaics.
+    """Return the calibration of the sensor, cached for all mosaics; None without one.
 
     Raises:
-        PolarguideError: it is missing, damaged or of another sensor.
+        PolarguideError: the file is missing, damaged or belongs to another sensor.
     """
     path = options.analyzers
     if path is None:
@@ -290,7 +292,7 @@ _BLOCKS = 1024
 
 
 def sample_blocks(values: NDArray[Any], size: int) -> NDArray[Any]:
-    """A regular subset of a mosaic's blocks, [N, size, size]."""
+    """Return a regular subset of the blocks of a mosaic, [N, size, size]."""
     rows = values.shape[0] // size
     columns = values.shape[1] // size
     grid = values[: rows * size, : columns * size].reshape(rows, size, columns, size)
@@ -299,20 +301,20 @@ def sample_blocks(values: NDArray[Any], size: int) -> NDArray[Any]:
 
 
 LARGE_IMBALANCE = 0.01
-"""Share by which pair sums differ that is worth a note where it is not corrected."""
+"""Relative difference of uncorrected pair sums above which the user gets a note."""
 
 
 def pair_gains(
     ratio: float | None, options: GainOptions, notes: Mapping[str, str], *, calibrated: bool = False
 ) -> tuple[Gains, list[str]]:
-    """Return the gains of the four angles, and notes for the user.
+    """Return the gains of the four angles and notes for the user.
 
     Args:
-        ratio: ratio of the pair sums; None where it is too dark to measure.
+        ratio: ratio of the pair sums; None if the pictures are too dark.
         options: gains of a calibration take precedence over ``gains``.
-        notes: sentence for each outcome, with a place for the ratio's deviation from 1. Outcomes are "dark", "off" (too
-            much for gains), "corrected" and "left" (uncorrected, by more than ``LARGE_IMBALANCE``).
-        calibrated: whether the intensities were corrected by analyzer vectors, which include gains.
+        notes: templates with a placeholder for the ratio minus 1, by outcome: "dark", "off" (too large for gains),
+            "corrected" and "left" (not corrected, above ``LARGE_IMBALANCE``).
+        calibrated: True if analyzer vectors, which include gains, have corrected the intensities.
     """
     if calibrated:
         return UNIT_GAINS, imbalance_notes(ratio)
@@ -333,27 +335,27 @@ def pair_gains(
 def as_displayed(
     linear: NDArray[np.float32], calibration: Calibration, orientation: int
 ) -> NDArray[np.float32]:
-    """Four shots [4, H, W, C] by true angle, turned as EXIF's orientation displays them."""
+    """Return four shots [4, H, W, C] by true angle, in the orientation that EXIF specifies for display."""
     turned = np.stack([apply_orientation(picture, orientation) for picture in oriented(linear, calibration)])
     return oriented(turned, orientation_calibration(orientation))
 
 
-# Logarithm of a ratio of exposures that are the same: files state three digits.
+# Largest difference of the logarithms of equal exposures: files state three digits.
 _EQUAL = 1e-3
 
 
 def light_of_files(
     views: Mapping[str, Sequence[Path]], advance: Advance | None = None
 ) -> tuple[dict[Path, float], str]:
-    """The exposure that each file of some views states (EXIF), for which light is divided by it.
+    """Return the exposure of each file by its EXIF tags, and a warning.
 
     Args:
-        views: the files of each.
+        views: files of each view.
         advance: receives the number of views that were read.
 
     Returns:
-        Those of the files that state one; none where files do not state the same tags. And a sentence for the user in
-        that case, else "".
+        The exposures of the files that state one, empty if files state different tags. The warning names the missing
+        tags in that case; otherwise it is empty.
 
     Raises:
         PolarguideError: a file cannot be read.
@@ -371,11 +373,11 @@ def light_of_files(
 def stated_exposures(
     views: Mapping[str, Sequence[Path]], advance: Advance | None = None
 ) -> tuple[dict[str, list[float]], str]:
-    """Relative exposures of ``light_of_files``, their geometric mean over all views 1.
+    """Return the relative exposures of each view by EXIF, with a geometric mean of 1, and a warning.
 
     Returns:
-        Those of all views; nothing where all state the same, or where files do not state the same tags. And the
-        sentence of ``light_of_files``.
+        The exposures of all views, empty if all are equal or files state different tags; and the warning of
+        ``light_of_files``.
     """
     stated, missing = light_of_files(views, advance)
     logs = {path: math.log(light) for path, light in stated.items()}
@@ -386,30 +388,30 @@ def stated_exposures(
 
 
 def exposure_notes(stated: Mapping[str, Sequence[float]]) -> list[str]:
-    """The exposures that the files state, in a sentence for the user."""
+    """Return a note on the exposures that the files state."""
     if not stated:
         return []
-    every = [value for of_view in stated.values() for value in of_view]
+    every = [value for exposures in stated.values() for value in exposures]
     stops = math.log2(max(every) / min(every))
-    within = sum(math.log(max(mine) / min(mine)) >= _EQUAL for mine in stated.values())
+    within = sum(math.log(max(exposures) / min(exposures)) >= _EQUAL for exposures in stated.values())
     return [
-        f"Exposures differ by up to {stops:.2f} stops by EXIF, in {within} views from shot to shot: taken back "
-        "(--gains none leaves them)."
+        f"Exposures differ by up to {stops:.2f} stops by EXIF, in {within} views from shot to shot. They are divided "
+        "out (--gains none keeps them)."
     ]
 
 
 def exposures_of_view(
     names: Sequence[str], gray: NDArray[np.floating[Any]], usable: NDArray[np.bool_], stated: Sequence[float]
 ) -> tuple[Gains, str]:
-    """The exposures of four shots: as their files state, unless their pair sums surely say otherwise.
+    """Return the exposures of four shots: those of their files, unless the pair sums contradict them significantly.
 
     Args:
         names: names of the shots, for messages.
-        gray: linear intensities [4, H, W]. usable: [H, W].
+        gray: linear intensities [4, H, W]. usable: mask [H, W].
         stated: exposures that the files state, or ones.
 
     Returns:
-        Gains by which the shots are divided; and a warning where the pair sums contradict the files, else "".
+        Gains by which the shots are divided, and a warning if the pair sums contradict the files, else "".
     """
     logs = np.log(np.asarray(stated, np.float64))
     mean = float(logs.mean())
@@ -422,10 +424,10 @@ def exposures_of_view(
         f"{names[ANGLES.index(angle)]} ({angle} degrees) by {factor - 1:+.0%}"
         for angle, factor in off.items()
     )
-    than = "than their EXIF exposures say" if differ else "than the other shots of the view"
+    reference = "than their EXIF exposures say" if differ else "than the other shots of the view"
     warning = (
-        f"exposed otherwise {than}, by the pair sums: {named}. The pair sums are believed. Automatic exposure, edited "
-        "pictures, or a filter that was not turned?"
+        f"exposed differently {reference}, by the pair sums: {named}. The pair sums are used. Automatic exposure, "
+        "edited pictures, or a filter that was not rotated?"
     )
     return _as_gains(np.exp(np.asarray(measured.logs) + mean)), warning
 
@@ -436,20 +438,21 @@ def _as_gains(values: Iterable[float]) -> Gains:
 
 
 COMPARABLE = "Keep one kind: their brightness cannot be compared."
-"""The remedy for several kinds of files in one capture or set."""
+"""Remedy for several kinds of files in one capture or set."""
 
 
-def require_one(where: Path, found: Iterable[tuple[str, Path]], expected: str, remedy: str) -> None:
-    """Refuse pictures that differ in what they should share, such as their size; the first file of each is named.
+def require_one(where: Path, kinds: Iterable[tuple[str, Path]], expected: str, remedy: str) -> None:
+    """Refuse pictures that differ in a property that they must share, such as their size.
 
     Args:
-        where: their folder. found: of each file, what it has, and its path. expected, remedy: for the message.
+        where: folder of the pictures. kinds: value of the property and path of each file.
+        expected, remedy: texts of the error.
 
     Raises:
-        PolarguideError: two differ.
+        PolarguideError: two files differ. The message names the first file of each value.
     """
     first: dict[str, Path] = {}
-    for name, path in found:
+    for name, path in kinds:
         first.setdefault(name, path)
     if len(first) > 1:
         named = " and ".join(f"{name} ({path.name})" for name, path in list(first.items())[:4])
@@ -493,7 +496,7 @@ def levels_of_shot(
 ) -> tuple[Levels, list[str]]:
     """Return the levels of the stored values of a single shot, and notes for the user.
 
-    Values that pile up are saturated, but do not change the full scale: it is the same for all shots of a series.
+    Values that pile up are saturated, but do not change the full scale, which all shots of a series share.
 
     Args:
         values: [K, ...] stored values. bits: bits of a sensor value, if they are known.
@@ -504,7 +507,7 @@ def levels_of_shot(
     """
     largest = int(values.max())
     counts = None
-    # Only values that end at a power of two can pile up. Counting takes longer than this test.
+    # Values can pile up only if their maximum is a power of two minus 1. Counting takes longer than this test.
     may_pile_up = container == 16 and largest < FULL_16 and largest & (largest + 1) == 0
     if may_pile_up and options.bits is None and options.saturation is None:
         parts = (np.bincount(part.ravel(), minlength=FULL_16 + 1) for part in values)
@@ -519,7 +522,7 @@ def levels_of_shot(
 def levels_of_pictures(
     paths: Sequence[Path], white: tuple[float, float, float], options: SampledOptions
 ) -> tuple[Levels | None, list[str]]:
-    """Return the levels of all pictures of a capture, and notes; None where every file states its full scale.
+    """Return the levels of all pictures of a capture, and notes; None if every file states its full scale.
 
     Args:
         paths: files of the capture. white: gains of R, G and B, for camera raw files.
@@ -549,7 +552,7 @@ class LinearShots:
         values: [K, H, W, 3] linear intensities, full scale 1.
         saturated: pixels with a saturated sample, [H, W].
         dark: pixels without light in any shot, [H, W].
-        outside: pixels that the camera's motion moved out of a shot, [H, W].
+        outside: pixels that the alignment moved out of a shot, [H, W].
         shifts: shifts of the shots.
         orientation: EXIF orientation of the shots.
         clipped_share, dark_share: shares of such pixels before the alignment.

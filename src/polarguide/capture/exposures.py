@@ -1,4 +1,4 @@
-"""The exposures of views: behind a polarizer at which angle or without one, how long; as names and tables say."""
+"""Exposures of views: angle of the polarizer, presence of a polarizer, and gain, read from file names and tables."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ from polarguide.optics import Mount
 Angle = float | Literal["unknown", "none"]
 """Degrees counter-clockwise from the picture's horizontal, modulo 180; or a word."""
 LARGEST = 3600.0
-"""Degrees; farther, a number says less and less about an angle."""
+"""Largest absolute angle in degrees that is accepted."""
 
 
 def parse_angle(text: str) -> Angle | None:
-    """The angle that a text states; None where it states none."""
+    """Parse an angle or one of the two words; None for other texts."""
     word = text.strip().lower()
     words: dict[str, Angle] = {"unknown": "unknown", "none": "none"}
     if word in words:
@@ -41,7 +41,7 @@ def parse_angle(text: str) -> Angle | None:
 
 
 def turned(angle: Angle, calibration: Calibration) -> Angle:
-    """The angle after sense and zero of a calibration: ``sense * angle + zero``, from 0 to below 180 degrees."""
+    """Apply sense and zero of a calibration to an angle: ``sense * angle + zero`` in degrees, in [0, 180)."""
     if isinstance(angle, str):
         return angle
     sign = -1 if calibration.sense == "cw" else 1
@@ -49,12 +49,12 @@ def turned(angle: Angle, calibration: Calibration) -> Angle:
 
 
 def angle_text(angle: Angle) -> str:
-    """An angle as tables state it."""
+    """Return an angle as text for tables."""
     return angle if isinstance(angle, str) else f"{angle:.10g}"
 
 
 def angle_labels(angles: Sequence[Angle]) -> list[str]:
-    """Parts of file names that identify the pictures of a view: 045, 012.5, unknown, none, unknown-2, ..."""
+    """Return labels of the pictures of a view for file names: 045, 012.5, unknown, none, unknown-2, ..."""
     labels: list[str] = []
     for angle in angles:
         label = angle if isinstance(angle, str) else f"{angle % 180:06.2f}".rstrip("0").rstrip(".")
@@ -64,9 +64,9 @@ def angle_labels(angles: Sequence[Angle]) -> list[str]:
 
 
 WELL_CONDITIONED = 0.15
-"""Least ``conditioning`` of analyzers from which Stokes vectors are computed; 0/45/90/135 have 0.71."""
+"""Smallest ``conditioning`` of analyzers for which Stokes vectors are computed; 0/45/90/135 have 0.71."""
 BALANCED = 0.05
-"""Analyzers whose mean is shorter measure S0 by their mean: a pair at right angles, marked to 1.4 degrees."""
+"""Largest length of the mean analyzer for which the mean intensity is S0/2: a right angle set to 1.4 degrees."""
 
 
 @dataclass(frozen=True)
@@ -74,9 +74,9 @@ class Exposure:
     """One picture of a view.
 
     Attributes:
-        angle: angle of the polarizer in degrees, in [0, 180); None where there is none, or where it is not known.
-        filtered: whether there was a polarizer before the lens or the sensor.
-        gain: by what its values have to be divided to be on the scale of the scene's other pictures.
+        angle: angle of the polarizer in degrees, in [0, 180); None without a polarizer or for an unknown angle.
+        filtered: True with a polarizer in front of the lens or the sensor.
+        gain: exposure relative to the other pictures of the scene. Values are divided by it.
     """
 
     angle: float | None = None
@@ -85,38 +85,36 @@ class Exposure:
 
     @property
     def known(self) -> bool:
-        """Whether it is known what the picture measures."""
+        """True if the picture has a known angle or no polarizer."""
         return self.angle is not None or not self.filtered
 
     @property
-    def words(self) -> str:
-        """Its name in messages."""
+    def label(self) -> str:
+        """Text for messages."""
         return "no filter" if not self.filtered else "unknown" if self.angle is None else f"{self.angle:g}"
 
 
 FOUR = tuple(Exposure(float(angle)) for angle in ANGLES)
-"""What a view of a polarization camera has."""
+"""Exposures of a view of a polarization camera."""
 PLAIN = (Exposure(filtered=False),)
-"""An ordinary photograph."""
+"""Exposures of an ordinary photograph."""
 
 
 def nominal(exposures: Sequence[Exposure]) -> Tensor:
-    """Analyzers [K, 2] float64 of known exposures on the optical axis; (0, 0) of one without a filter."""
-    zero = torch.zeros(1, 3, dtype=torch.float64)
-    cosines = [
-        torch.zeros(2, dtype=torch.float64)
-        if e.angle is None
-        else optics.analyzer(math.radians(e.angle), zero)
-        for e in exposures
-    ]
+    """Return the analyzers [K, 2] of known exposures on the optical axis, float64; (0, 0) without a filter."""
+    axis = torch.zeros(1, 3, dtype=torch.float64)
+    none = torch.zeros(2, dtype=torch.float64)
+    cosines = [none if e.angle is None else optics.analyzer(math.radians(e.angle), axis) for e in exposures]
     return torch.stack(cosines) if cosines else torch.zeros(0, 2, dtype=torch.float64)
 
 
 def analyzers(exposures: Sequence[Exposure], rays: Tensor, mount: Mount) -> Tensor:
-    """Analyzers of known exposures: [K, 2], or [K, 2, H, W] of a filter before the lens.
+    """Return the analyzers of known exposures: [K, 2], or [K, 2, H, W] for a filter in front of the lens.
 
     Args:
-        rays: [H, W, 3] unit, camera axes.
+        exposures: known exposures.
+        rays: unit rays [H, W, 3] in camera axes.
+        mount: place of the polarizer.
     """
     if mount == "sensor":
         return nominal(exposures).to(rays)
@@ -127,11 +125,12 @@ def analyzers(exposures: Sequence[Exposure], rays: Tensor, mount: Mount) -> Tens
 
 
 def conditioning(analyzers: Tensor) -> float:
-    """Smallest over largest singular value of the rows (1, cos 2t, sin 2t): 0.71 for evenly spread angles; 0 where they
-    do not determine a Stokes vector.
+    """Return the smallest over the largest singular value of the rows (1, cos 2t, sin 2t).
+
+    Evenly spread angles have 0.71. Angles that do not determine a Stokes vector have 0.
 
     Args:
-        analyzers: [K, 2].
+        analyzers: pairs (cos 2t, sin 2t), [K, 2].
     """
     if len(analyzers) < 3:
         return 0.0
@@ -141,19 +140,20 @@ def conditioning(analyzers: Tensor) -> float:
 
 
 def determine_stokes(exposures: Sequence[Exposure]) -> bool:
-    """Whether the exposures that are known determine a Stokes vector at every pixel, and well enough."""
+    """Return True if the known exposures determine a well-conditioned Stokes vector at every pixel."""
     known = [e for e in exposures if e.known]
     return conditioning(nominal(known)) >= WELL_CONDITIONED
 
 
 def measure_radiance(exposures: Sequence[Exposure]) -> bool:
-    """Whether S0 is measured: without a filter, by a pair at right angles, or by what determines the Stokes vector."""
+    """Return True if S0 is measured: without a filter, by a pair at right angles, or by a full Stokes vector."""
     return determine_stokes(exposures) or bool(radiance_places(exposures))
 
 
 def radiance_places(exposures: Sequence[Exposure]) -> tuple[int, ...]:
-    """The places of the exposures whose mean is S0/2: those without a filter, else all that are known if they balance;
-    none where there are no such.
+    """Return the indices of the exposures whose mean is S0/2.
+
+    These are the exposures without a filter, else all known ones if they are balanced, else none.
     """
     plain = tuple(k for k, e in enumerate(exposures) if not e.filtered)
     if plain:
@@ -164,37 +164,37 @@ def radiance_places(exposures: Sequence[Exposure]) -> tuple[int, ...]:
 
 
 def normalized(angle: float) -> float:
-    """An angle in degrees taken modulo 180."""
-    turned = angle % 180.0
-    return 0.0 if turned == 180.0 else turned  # what tiny negative angles round to
+    """Return an angle in degrees modulo 180, in [0, 180)."""
+    remainder = angle % 180.0
+    return 0.0 if remainder == 180.0 else remainder  # tiny negative angles round to 180
 
 
-def found(exposure: Exposure, angle: float, gain: float) -> Exposure:
-    """The exposure with an angle (degrees) that was found, and its gain."""
+def with_estimate(exposure: Exposure, angle: float, gain: float) -> Exposure:
+    """Return an exposure with an estimated angle in degrees and gain."""
     return replace(exposure, angle=normalized(angle), gain=gain)
 
 
 TABLE = "angles.csv"
 _COLUMNS = ("file", "view", "angle", "gain", "modulation", "note")
 _NEEDED = ("file", "angle")
-# Columns that a training writes, and that are not read.
+# Columns that a training writes for the user. A reader ignores them.
 _WRITTEN_BY_TRAINING = ("modulation", "note")
-# A camera exposes over some twenty stops either way; more leaves no numbers in single precision.
+# Cameras cover about twenty stops. Larger gains overflow single precision.
 _LARGEST_GAIN = 1e6
-_REMEDY = "Columns are file, angle (degrees, unknown or none) and, where wanted, view and gain, with commas between."
+_REMEDY = "Use the columns file, angle (degrees, unknown or none) and optionally view and gain, separated by commas."
 
 
 @dataclass(frozen=True)
 class Line:
-    """A line of the table.
+    """One line of the table of angles.
 
     Attributes:
-        number: number of the line, from 1.
-        file: the picture's name, without detours such as ``./``: inside ``polar/`` of a scene, else relative to the
-            folder of the photographs.
-        view: pictures of one view share their pose; None for a view of its own, called like the file without suffix.
+        number: line number, from 1.
+        file: normalized name of the picture: in ``polar/`` of a scene, else relative to the folder of photographs.
+        view: view of the picture; None for a view of its own, named like the file without suffix. All pictures of a
+            view share a pose.
         angle: angle of the polarizer.
-        gain: exposure relative to the other pictures; None if it is not given.
+        gain: exposure relative to the other pictures; None for an empty cell.
     """
 
     number: int
@@ -205,7 +205,7 @@ class Line:
 
     @property
     def exposure(self) -> Exposure:
-        """The exposure; its gain is 1 if it is not given."""
+        """The exposure, with a gain of 1 for an empty cell."""
         gain = 1.0 if self.gain is None else self.gain
         if isinstance(self.angle, str):
             return Exposure(filtered=self.angle == "unknown", gain=gain)
@@ -213,11 +213,11 @@ class Line:
 
 
 def read_table(path: Path) -> list[Line]:
-    """The lines of a table, in their order. Empty cells at the end of a line may be left out.
+    """Return the lines of a table in their order. Empty cells at the end of a line may be missing.
 
     Raises:
         PolarguideError: the table cannot be read, a column is missing or unknown, a file is listed twice, or an angle
-            or gain is not a number; the message has the line.
+            or gain is invalid. The error names the line.
     """
     rows = read_rows(path, _REMEDY)
     columns = _header(path, rows[0][1] if rows else [])
@@ -225,10 +225,10 @@ def read_table(path: Path) -> list[Line]:
     for number, row in rows[1:]:
         where = f"{path} (line {number})"
         if not len(_NEEDED) <= len(row) <= len(columns):
-            found = f"{len(row)}: {shortened(','.join(row))}"
+            cells = f"{len(row)}: {shortened(','.join(row))}"
             if len(row) > len(columns) and decimal_comma(map(",".join, itertools.pairwise(row))):
-                found += ", which may be a decimal comma"
-            raise PolarguideError(where, expected=f"{len(columns)} cells", found=found, remedy=_REMEDY)
+                cells += ", which may be a decimal comma"
+            raise PolarguideError(where, expected=f"{len(columns)} cells", found=cells, remedy=_REMEDY)
         line = _line(where, number, dict(zip(columns, row, strict=False)))
         if line.file in lines:
             raise _listed_twice(where, lines[line.file], line)
@@ -237,7 +237,7 @@ def read_table(path: Path) -> list[Line]:
 
 
 def files_of(root: Path, table: Path, lines: Sequence[Line]) -> list[Path]:
-    """The files of a table's lines in a folder, as the file system has them; they need not exist.
+    """Return the path of each line as the file system spells it. The files need not exist.
 
     Raises:
         PolarguideError: two lines name one file.
@@ -257,7 +257,7 @@ def _listed_twice(where: str, first: Line, second: Line) -> PolarguideError:
         where,
         expected="one line for each file",
         found=f"two for {names}, lines {first.number} and {second.number}",
-        remedy="Remove one of them.",
+        remedy="Remove one of the lines.",
     )
 
 
@@ -275,7 +275,7 @@ def _header(path: Path, row: list[str]) -> list[str]:
 
 
 def _line(where: str, number: int, cells: Mapping[str, str]) -> Line:
-    """One line from its cells by column."""
+    """Parse a line from its cells by column."""
     file = cells["file"]
     if not file:
         raise PolarguideError(where, expected="the name of a file", found="an empty cell", remedy=_REMEDY)
@@ -285,7 +285,7 @@ def _line(where: str, number: int, cells: Mapping[str, str]) -> Line:
             f"{where}, {file}",
             expected=f"an angle in degrees up to {LARGEST:g}, unknown or none",
             found=_cell(cells.get("angle", "")),
-            remedy="Write unknown where the angle was not noted, none where there was no filter.",
+            remedy="Write unknown for an angle that was not noted, and none for a picture without a filter.",
         )
     gain = number_or_nan(cells["gain"]) if cells.get("gain") else None
     if gain is not None and not 1 / _LARGEST_GAIN <= gain <= _LARGEST_GAIN:
@@ -293,7 +293,7 @@ def _line(where: str, number: int, cells: Mapping[str, str]) -> Line:
             f"{where}, {file}",
             expected=f"a gain from {1 / _LARGEST_GAIN:g} to {_LARGEST_GAIN:g}, or an empty cell",
             found=_cell(cells["gain"]),
-            remedy="Leave it empty if it is not known.",
+            remedy="Leave the cell empty if the gain is unknown.",
         )
     return Line(
         number, posixpath.normpath(canonical(file)), canonical(cells.get("view", "")) or None, angle, gain
@@ -301,51 +301,49 @@ def _line(where: str, number: int, cells: Mapping[str, str]) -> Line:
 
 
 def _cell(text: str) -> str:
-    """A cell that is no number, for messages."""
+    """Return the text of an invalid number for messages."""
     comma = decimal_comma([text])
     return f"{comma} with a decimal comma; numbers have a point" if comma else shortened(text)
 
 
 def table_text(lines: Iterable[tuple[str, str, Exposure, float | None, str]]) -> str:
-    """A table as CSV text: file, view, exposure, modulation as of ``FittedAngle`` (None: not fitted), and a note."""
+    """Return a table as CSV text.
+
+    Args:
+        lines: file, view, exposure, modulation (see ``FittedAngle``; None if it was not fitted) and note of each
+            picture.
+    """
     rows: list[list[object]] = [[*_COLUMNS]]
     for file, view, exposure, modulation, note in lines:
         known = "unknown" if exposure.angle is None else f"{exposure.angle:.2f}"
-        modulation_text = None if modulation is None else f"{modulation:.2f}"
-        rows.append(
-            [
-                file,
-                view,
-                known if exposure.filtered else "none",
-                f"{exposure.gain:.4f}",
-                modulation_text,
-                note,
-            ]
-        )
+        angle = known if exposure.filtered else "none"
+        strength = None if modulation is None else f"{modulation:.2f}"
+        rows.append([file, view, angle, f"{exposure.gain:.4f}", strength, note])
     return csv_lines(rows)
 
 
 FEWEST = 3
-"""Different angles that determine a Stokes vector."""
+"""Smallest number of different angles that determines a Stokes vector."""
 NAMING = (
-    "Name files like cup_045.jpg, cup_a30.jpg, cup_unknown.jpg or cup_none.jpg (numbers without a letter are multiples "
-    "of 15 or go evenly around half a turn); or write angles.csv with the columns file,angle, or give --angles unknown."
+    "Name files like cup_045.jpg, cup_a30.jpg, cup_unknown.jpg or cup_none.jpg (numbers without a letter must be "
+    "multiples of 15 or evenly spaced over half a turn); or write angles.csv with the columns file,angle; or use "
+    "--angles unknown."
 )
 _WORDS = "unknown|none"
 _NUMBER = r"(?P<mark>angle|pol|a|i)?[-_ ]?(?P<angle>\d{1,3}(?:\.\d+)?)(?P<unit>deg)?"
-# A minus right before a number is its sign if another sign separates it from the view: cup_-45, but not cup-45.
+# A minus before a number is its sign if another separator precedes it: cup_-45, but not cup-45.
 _APART = r"(?:[-_ .]*[_ .](?P<minus>-)(?=\d)|[-_ .]+)"
 _SINGLE = re.compile(rf"(?P<view>.+?){_APART}(?:{_NUMBER}|(?P<word>{_WORDS}))", re.IGNORECASE)
-# Degrees between the marks of a filter's ring: other numbers need a letter, as they may count pictures.
+# Degrees between the marks of a filter's ring. Other numbers need a letter because they may count pictures.
 _MARKS = 15
 _NUMBERED = re.compile(rf"(?:(?P<view>.+?){_APART}|(?P<alone>-))?(?P<number>\d{{1,3}}(?:\.\d+)?)")
 _SMALLEST_STEP = 2.0
-"""Degrees: numbers that rise by one may count pictures."""
+"""Smallest step of evenly spaced angles in degrees. Numbers that increase by one may count pictures."""
 _ALIKE = 1e-6
 
 
 def folders_of_angles(root: Path) -> dict[Path, Angle]:
-    """The folders in a folder that are named like angles, in the order of their names."""
+    """Return the subfolders named like angles with their angles, in the order of their names."""
     folders = [path for path in sorted(root.iterdir()) if path.is_dir()]
     names = angles_of_names([path.name for path in folders], folders=True)
     return {
@@ -354,11 +352,15 @@ def folders_of_angles(root: Path) -> dict[Path, Angle]:
 
 
 def angles_of_names(names: Sequence[str], *, folders: bool = False) -> list[tuple[str, Angle] | None]:
-    """View ("" where the name is an angle alone) and angle that each name states; None where it states none.
+    """Return the view and angle that each name states; None for a name without an angle.
 
-    A number counts as an angle if it has a letter or a unit, if it is a multiple of 15 below 180, and where all numbers
-    of a view are evenly spaced over half a turn or a whole one: 10, 40, ..., 160, or 0 to 175 by 5. ``folders``: names
-    such as I_10 are angles alone, and no view I.
+    The view is "" for a name that is an angle alone. A number with a letter or a unit is an angle, and so is a multiple
+    of 15 below 180. Other numbers are angles if all numbers of a view are evenly spaced over half a turn or a whole
+    one, such as 10, 40, ..., 160.
+
+    Args:
+        names: file names without suffix, or names of folders.
+        folders: True for names of folders. A name such as I_10 is then an angle alone, without a view I.
     """
     stated = [_stated(name, folders) for name in names]
     numbered: dict[str, list[tuple[int, float]]] = {}
@@ -376,7 +378,7 @@ def angles_of_names(names: Sequence[str], *, folders: bool = False) -> list[tupl
 
 
 def _stated(name: str, folder: bool) -> tuple[str, Angle] | None:
-    """View and angle of a single name, of a picture or of a folder."""
+    """Return view and angle of one name of a picture or folder."""
     parts = None if folder else split_name(name)
     if parts is None and (alone := split_name(f"x_{name}")) is not None and alone[0] == "x":
         return "", alone[1]
@@ -384,7 +386,7 @@ def _stated(name: str, folder: bool) -> tuple[str, Angle] | None:
 
 
 def covers_turn(angles: Sequence[float]) -> bool:
-    """Whether angles in degrees are evenly spaced over half a turn or a whole one, its end included or not."""
+    """Return True if angles in degrees are evenly spaced over 180 or 360 degrees, with or without the end."""
     different = sorted(set(angles))
     if len(different) < FEWEST:
         return False
@@ -397,14 +399,14 @@ def covers_turn(angles: Sequence[float]) -> bool:
 
 
 def split_name(stem: str) -> tuple[str, Angle] | None:
-    """View and angle in a file's name; None where it states no angle."""
+    """Return view and angle that a file name states; None without an angle."""
     match = _SINGLE.fullmatch(stem)
     angle = None if match is None else _angle_of(match)
     return None if match is None or angle is None else (match["view"], angle)
 
 
 def _angle_of(match: re.Match[str]) -> Angle | None:
-    """The angle that a name states; None for numbers that may count pictures."""
+    """Return the angle of a matched name; None for a number that may count pictures."""
     if match["word"]:
         return parse_angle(match["word"])
     number = -float(match["angle"]) if match["minus"] else float(match["angle"])

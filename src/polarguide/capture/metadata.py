@@ -1,4 +1,4 @@
-"""Files beside the pictures: ``split.json``, ``scene.json``, and the ground truth of views, ``gt/<view>.npz``."""
+"""Files next to the pictures: ``split.json``, ``scene.json``, and the ground truth of views, ``gt/<view>.npz``."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ from polarguide.optics import Mount
 
 LEAST_INDEX = 1.0
 LARGEST_INDEX = 4.0
-# Of the numbers in materials/, the first that the table of scene.json explains.
+# First number in materials/ that scene.json defines.
 FIRST_LISTED = 3
 Index = Annotated[float, msgspec.Meta(gt=LEAST_INDEX, lt=LARGEST_INDEX)]
 
 
 class _Split(msgspec.Struct):
-    """``split.json``; what else it says is passed over."""
+    """Held-out views in ``split.json``; other fields are ignored."""
 
     test: list[str]
 
@@ -45,19 +45,19 @@ class _Object(msgspec.Struct):
 
 
 class _Dielectric(msgspec.Struct):
-    """A dielectric that ``materials/`` names by a number."""
+    """Dielectric with a number in ``materials/``."""
 
     refractive_index: Index
 
 
 class _Materials(msgspec.Struct):
-    """The table of materials in ``scene.json``."""
+    """Table of materials in ``scene.json``."""
 
     materials: dict[str, _Dielectric] = {}
 
 
 class _Scene(msgspec.Struct):
-    """The fields of ``scene.json`` that are read; others are ignored."""
+    """Fields of ``scene.json``; others are ignored."""
 
     refractive_index: Index | None = None
     objects: list[_Object] = []
@@ -67,13 +67,13 @@ class _Scene(msgspec.Struct):
 
 
 class _Polarizer(msgspec.Struct):
-    """Where ``scene.json`` says that the polarizer was."""
+    """Place of the polarizer in ``scene.json``."""
 
     polarizer: Mount = "sensor"
 
 
 class _Angles(msgspec.Struct):
-    """A calibration as ``scene.json`` notes it."""
+    """Calibration in ``scene.json``."""
 
     order: tuple[int, int, int, int] = ANGLES
     sense: Sense = "ccw"
@@ -84,22 +84,22 @@ class _Angles(msgspec.Struct):
 
 
 class _Prepared(msgspec.Struct):
-    """Changes that ``prepare`` and ``inspect --fix`` have made to the angles."""
+    """Changes of the angles by ``prepare`` and ``inspect --fix``."""
 
     calibration: _Angles | None = None
     corrections: list[_Angles] = []
 
 
 def held_out(path: Path, data: bytes, names: list[str]) -> tuple[str, ...]:
-    """The names of the test views that ``split.json`` lists, sorted.
+    """Read the names of the held-out views from ``split.json``, sorted.
 
     Args:
-        path: ``split.json``, for messages.
+        path: path of ``split.json`` for messages.
         data: its content.
         names: all view names of the capture, sorted.
 
     Raises:
-        PolarguideError: the split has another form, names an unknown view, or leaves nothing to train on.
+        PolarguideError: the split is invalid, has an unknown view, or leaves no training view.
     """
     remedy = 'List the names of the test views, {"test": ["<view>", ...]}, or remove the file.'
     test = [canonical(name) for name in decode(data, _Split, path, remedy=remedy).test]
@@ -109,22 +109,22 @@ def held_out(path: Path, data: bytes, names: list[str]) -> tuple[str, ...]:
     require(
         len(set(test)) < len(names),
         path,
-        expected="at least one view to train on",
+        expected="at least one training view",
         found=f"all {len(names)} views in the test set",
-        remedy="Name fewer test views in split.json, or add views.",
+        remedy="Remove test views from split.json, or add views.",
     )
     return tuple(sorted(set(test)))
 
 
 def refractive_index_of(path: Path, data: bytes) -> float | None:
-    """The one index in ``scene.json``, or None: ``refractive_index``, else the ``ior`` its objects agree on, between 1
-    and 4.
+    """Return the refractive index in ``scene.json``: ``refractive_index``, or the common ``ior`` of objects, or None.
 
     Args:
-        path: ``scene.json``, for messages. data: its content.
+        path: path of ``scene.json`` for messages.
+        data: its content.
 
     Raises:
-        PolarguideError: the index is not a number between 1 and 4.
+        PolarguideError: ``refractive_index`` is not a number between 1 and 4.
     """
     scene = decode(data, _Scene, path, remedy="Correct it, or remove it to use the default.")
     if scene.refractive_index is not None:
@@ -136,11 +136,13 @@ def refractive_index_of(path: Path, data: bytes) -> float | None:
 
 
 def indices_of(path: Path, data: bytes) -> dict[int, float]:
-    """Refractive indices of the dielectrics that ``materials/`` names by numbers from 3 on: ``materials`` in
-    ``scene.json``, as ``{"3": {"refractive_index": 1.33}}``.
+    """Return the refractive indices of dielectrics by their number in ``materials/``, from 3 on.
+
+    They are in ``materials`` of ``scene.json``, as ``{"3": {"refractive_index": 1.33}}``.
 
     Args:
-        path: ``scene.json``, for messages. data: its content.
+        path: path of ``scene.json`` for messages.
+        data: its content.
 
     Raises:
         PolarguideError: a number or an index is out of range.
@@ -160,27 +162,29 @@ def indices_of(path: Path, data: bytes) -> dict[int, float]:
 
 
 def mount_of(path: Path, data: bytes) -> Mount:
-    """Where the polarizer was: ``polarizer`` in ``scene.json``, "sensor" where it says nothing.
+    """Return the place of the polarizer: ``polarizer`` in ``scene.json``, by default "sensor".
 
     Args:
-        path: ``scene.json``, for messages. data: its content.
+        path: path of ``scene.json`` for messages.
+        data: its content.
 
     Raises:
-        PolarguideError: ``polarizer`` is something else than "sensor" or "filter".
+        PolarguideError: ``polarizer`` is not "sensor" or "filter".
     """
     return decode(
         data,
         _Polarizer,
         path,
-        remedy='Write "sensor" for polarizers behind the lens, "filter" for a sheet before it.',
+        remedy='Write "sensor" for polarizers on the sensor, "filter" for a sheet in front of the lens.',
     ).polarizer
 
 
 def keeps_gains(path: Path, data: bytes) -> bool:
-    """True where the scene was prepared with ``--gains none``, which leaves exposures as they are.
+    """Return True for a scene of ``prepare --gains none``, which does not change exposures.
 
     Args:
-        path: ``scene.json``, for messages. data: its content.
+        path: path of ``scene.json`` for messages.
+        data: its content.
     """
     prepared = decode(data, _Scene, path, remedy="Prepare the scene again.").prepare
     request = prepared.get("request") if isinstance(prepared, dict) else None
@@ -189,16 +193,17 @@ def keeps_gains(path: Path, data: bytes) -> bool:
 
 
 def applied_calibration(path: Path, data: bytes) -> Calibration | None:
-    """Order, sense and zero that the pictures of a prepared scene were made with, corrections included.
+    """Return order, sense and zero of a prepared scene's pictures, including corrections.
 
     Args:
-        path: ``scene.json``, for messages. data: its content.
+        path: path of ``scene.json`` for messages.
+        data: its content.
 
     Returns:
-        None for a scene that ``prepare`` did not write.
+        The calibration; None for a scene that ``prepare`` did not write.
 
     Raises:
-        PolarguideError: ``prepare`` wrote it, and its calibration is damaged.
+        PolarguideError: the calibration is invalid.
     """
     if decode(data, _Scene, path, remedy="Prepare the scene again.").prepare is None:
         return None
@@ -213,37 +218,39 @@ Origin = Literal["mosaics", "stokes", "other"]
 
 
 def origin_of(path: Path, data: bytes) -> Origin:
-    """The files that ``prepare`` made a scene of: mosaics of a sensor, a dataset's Stokes vectors, or others.
+    """Return the kind of files of a prepared scene: mosaics of a sensor, Stokes vectors of a dataset, or others.
 
     Args:
-        path: ``scene.json``, for messages. data: its content.
+        path: path of ``scene.json`` for messages.
+        data: its content.
     """
     scene = decode(data, _Scene, path, remedy="Prepare the scene again.")
     if scene.prepare is None:
         return "other"
-    if scene.pair_sums is not None:  # noted where the four intensities were computed
+    if scene.pair_sums is not None:  # written with computed intensities
         return "stokes"
     return "mosaics" if isinstance(scene.sensor, str) else "other"
 
 
 ROUGH = 0.15
-"""GGX roughness above which a surface is called rough: its lobe is wider than some nine degrees to each side."""
+"""GGX roughness of a rough surface. Its lobe is wider than some nine degrees to each side."""
 LARGEST_ID = 65535
 MaterialClass = Literal["metal", "rough metal", "dielectric", "rough dielectric", "matte"]
 METAL_CLASSES: tuple[MaterialClass, ...] = ("metal", "rough metal")
 METALS = ("metal", "conductor", "roughconductor")
 DIELECTRICS = ("plastic", "pplastic", "roughplastic", "dielectric", "roughdielectric", "principled")
 MATTE = ("matte", "diffuse")
-_OBJECTS_REMEDY = (
-    "Correct it, or remove objid from the ground truth: then errors are not told apart by object."
-)
+_OBJECTS_REMEDY = "Correct it, or remove objid from the ground truth to score all objects together."
 
 
 class Material(msgspec.Struct, frozen=True):
-    """A surface as ``scene.json`` names it; what else it says is passed over.
+    """Material in ``scene.json``; other fields are ignored.
 
     Attributes:
-        type: such as "plastic" or "roughconductor". alpha: GGX roughness. ior: refractive index. k: extinction.
+        type: name of the material, such as "plastic" or "roughconductor".
+        alpha: GGX roughness.
+        ior: refractive index.
+        k: extinction coefficient.
     """
 
     type: str = ""
@@ -253,10 +260,10 @@ class Material(msgspec.Struct, frozen=True):
 
     @property
     def kind(self) -> MaterialClass | None:
-        """The class that errors are told apart by; None where the table does not say enough.
+        """Class of the material for scores; None if the table is insufficient.
 
-        A metal has an extinction ``k`` or the type of one, a dielectric an index ``ior`` or the type of one. Either is
-        rough if its ``alpha`` exceeds ``ROUGH``. Matte is what has no reflection of its own at all.
+        A metal has an extinction coefficient ``k`` or a metal type, a dielectric an index ``ior`` or a dielectric type.
+        Both are rough if ``alpha`` exceeds ``ROUGH``. Matte surfaces have no specular reflection.
         """
         rough = self.alpha is not None and self.alpha > ROUGH
         if self.type in METALS or self.k is not None:
@@ -267,11 +274,13 @@ class Material(msgspec.Struct, frozen=True):
 
 
 class SceneObject(msgspec.Struct, frozen=True):
-    """An object of the scene.
+    """Object of a scene.
 
     Attributes:
-        id: its number in ``objid`` of the ground truth, from 1 up; 0 is no object.
-        name: unique. foreground: whether it belongs to the mask. material: its surface.
+        id: number in ``objid`` of the ground truth, from 1; 0 means no object.
+        name: unique name.
+        foreground: True if the object belongs to the mask.
+        material: material of the surface.
     """
 
     id: Annotated[int, msgspec.Meta(ge=1, le=LARGEST_ID)]
@@ -281,16 +290,17 @@ class SceneObject(msgspec.Struct, frozen=True):
 
 
 class _ObjectTable(msgspec.Struct):
-    """The fields of ``scene.json`` that are read."""
+    """Table of objects in ``scene.json``."""
 
     objects: list[SceneObject] | None = None
 
 
 def objects_of(path: Path, data: bytes) -> tuple[SceneObject, ...]:
-    """The table of objects in ``scene.json``; empty if there is none.
+    """Return the objects in ``scene.json``, which may have none.
 
     Args:
-        path: ``scene.json``, for messages. data: its content.
+        path: path of ``scene.json`` for messages.
+        data: its content.
 
     Raises:
         PolarguideError: an object has no number or name, or shares it with another.
@@ -298,12 +308,12 @@ def objects_of(path: Path, data: bytes) -> tuple[SceneObject, ...]:
     objects = decode(data, _ObjectTable, path, remedy=_OBJECTS_REMEDY).objects or []
     for field in ("id", "name"):
         counts = Counter(getattr(item, field) for item in objects)
-        twice, times = next(iter(counts.most_common(1)), (None, 0))
+        value, times = next(iter(counts.most_common(1)), (None, 0))
         require(
             times <= 1,
             f"{path} (objects)",
-            expected=f"objects of which each has its own {field}",
-            found=f"two with the {field} {twice}",
+            expected=f"a unique {field} of each object",
+            found=f"{times} with the {field} {value}",
             remedy=_OBJECTS_REMEDY,
         )
     return tuple(objects)
@@ -312,10 +322,10 @@ def objects_of(path: Path, data: bytes) -> tuple[SceneObject, ...]:
 _CHANNELS = {"normal": 3, "depth": 0, "mask": 0, "specular": 3, "diffuse": 3, "objid": 0}
 
 _NOT_NEGATIVE = ("depth", "specular", "diffuse")
-_ROUNDING = 1e-3  # of differences of what was rendered
+_ROUNDING = 1e-3  # rounding error of differences of rendered values
 _LARGEST_NUMBER = 16  # bytes
 _LARGEST_HEADERS = 1 << 18  # bytes
-_LARGEST_TRUTH = 1e18  # its square still is a number in single precision
+_LARGEST_TRUTH = 1e18  # its square is finite in single precision
 
 
 @dataclass(frozen=True, eq=False)
@@ -323,12 +333,12 @@ class GroundTruth:
     """Ground truth of a view. Any field may be None.
 
     Attributes:
-        normal: unit surface normals in the world, zero where there is no surface, [H, W, 3] float32.
-        depth: camera z in world units, 0 where there is no surface or it is not known, [H, W] float32.
-        mask: foreground, [H, W] bool.
-        specular, diffuse: first-surface lobes as linear S0, in the exposure of the pictures, [H, W, 3]
-            float32. Pictures are S0 / 2, so compare rendered layers with half of these.
-        object_ids: which object each pixel shows, as ``SceneObject.id``; 0 for none, or several, [H, W] int32.
+        normal: unit surface normals in the world, zero without a surface, [H, W, 3] float32.
+        depth: camera z in world units, 0 without a surface or if unknown, [H, W] float32.
+        mask: foreground mask, [H, W] bool.
+        specular, diffuse: first-surface lobes as linear S0 in the exposure of the pictures, [H, W, 3] float32. Pictures
+            are S0 / 2, so rendered layers are compared with half of these.
+        object_ids: ``SceneObject.id`` of each pixel, 0 for none or several objects, [H, W] int32.
     """
 
     normal: Tensor | None = None
@@ -340,16 +350,15 @@ class GroundTruth:
 
 
 def read_ground_truth(path: Path, data: bytes, *, size: tuple[int, int], factor: int) -> GroundTruth:
-    """Read one ground-truth file.
+    """Read a ground-truth file.
 
     Args:
-        path: path of the file, for messages.
-        data: the whole file, NumPy's .npz with any of the arrays ``normal``, ``depth``, ``mask``,
-            ``specular``, ``diffuse`` and ``objid``; others are ignored.
-        size: height and width of the pictures as stored.
-        factor: side of the boxes to average. Normals are averaged and brought back to unit length; a pixel is
-            foreground only where its whole box is, has a depth only where its whole box has, and shows an object only
-            where its whole box does.
+        path: path of the file for messages.
+        data: content of the ``.npz`` file with any of the arrays ``normal``, ``depth``, ``mask``, ``specular``,
+            ``diffuse`` and ``objid``; others are ignored.
+        size: height and width of the stored pictures.
+        factor: side of the averaged boxes. Normals are averaged and normalized. A pixel is foreground, has a depth or
+            shows an object only if its whole box does.
 
     Raises:
         PolarguideError: the file cannot be read, an array has another size, or values are not finite.
@@ -385,6 +394,7 @@ def read_ground_truth(path: Path, data: bytes, *, size: tuple[int, int], factor:
 
 
 def _check_truth(path: Path, name: str, array: NDArray[Any], size: tuple[int, int]) -> None:
+    """Refuse an array of another size or type, or with impossible values."""
     shape = (*size, _CHANNELS[name]) if _CHANNELS[name] else size
     if array.shape != shape or array.dtype.kind not in "biuf":
         raise PolarguideError(
@@ -398,9 +408,9 @@ def _check_truth(path: Path, name: str, array: NDArray[Any], size: tuple[int, in
     ):
         raise PolarguideError(
             f"{path} (objid)",
-            expected=f"whole numbers from 0 to {LARGEST_ID}, those of scene.json's objects",
+            expected=f"whole numbers from 0 to {LARGEST_ID}, the ids of objects in scene.json",
             found=f"{array.dtype} from {array.min()} to {array.max()}",
-            remedy="Write the numbers of the objects, and 0 where there is none.",
+            remedy="Write the ids of the objects, and 0 for pixels without an object.",
         )
     if array.dtype.kind not in "if":
         return
@@ -409,16 +419,16 @@ def _check_truth(path: Path, name: str, array: NDArray[Any], size: tuple[int, in
             f"{path} ({name})",
             expected="numbers of 0 or more",
             found=f"down to {array.min():g}",
-            remedy="Depth counts along the camera's z axis, away from it; light is never negative.",
+            remedy="Depth is the distance along the camera's z axis; light is never negative.",
         )
     if array.dtype.kind != "f":
         return
     most = min(_LARGEST_TRUTH, float(np.finfo(array.dtype).max))
-    broken = array.size - int(np.count_nonzero(np.abs(array) <= most))  # NaN is not
+    broken = array.size - int(np.count_nonzero(np.abs(array) <= most))  # NaN compares False
     if broken:
         raise PolarguideError(
             f"{path} ({name})",
             expected=f"finite numbers up to {_LARGEST_TRUTH:g}",
             found=f"{broken} of {array.size} values that are NaN, infinite or larger",
-            remedy="Write 0 where the value is unknown or too large, and set those pixels of the mask to 0.",
+            remedy="Write 0 for unknown or too large values, and set these pixels of the mask to 0.",
         )

@@ -1,6 +1,6 @@
-"""Pictures of one place through a filter at known angles: which of them contradict the others.
+"""Comparison of pictures of one view through a filter at known angles.
 
-Wrong angles, other exposures and motion show in how far a picture is from what the others predict.
+The other pictures of the view predict each picture. A large residual shows a wrong angle, another exposure or motion.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.special import gammaincinv
 
-from polarguide.capture.angle_evidence import angle_difference, tolerance
+from polarguide.capture.angle_evidence import AngleEstimate
 from polarguide.capture.exposures import WELL_CONDITIONED, Exposure, conditioning, nominal
 from polarguide.capture.view import FULL_CODE
 
@@ -26,13 +26,13 @@ class SetLimits:
     """Constants of the comparison of pictures.
 
     Attributes:
-        marks: degrees to which a ring is set by its marks. A smaller difference is not called wrong.
-        against: times the typical residual of the other pictures from which on a picture contradicts them.
-        brighter: share of the light from which on a contradicting picture is called brighter or darker.
+        marks: precision in degrees of the marks on a filter ring. Smaller differences are not errors.
+        against: largest residual of a picture that agrees with the others, over their median residual.
+        brighter: relative brightness above which a contradicting picture is called brighter or darker.
         most_pixels: largest number of pixels of a set that are compared.
-        fewest_pixels: number of pixels from which on pictures are compared.
-        determined: standard error in degrees up to which the light determines a picture's angle.
-        over_noise: times the noise from which on the polarization varies over the picture.
+        fewest_pixels: smallest number of pixels for a comparison.
+        determined: largest standard error in degrees of an angle that the light determines.
+        over_noise: smallest variation of the polarization over the picture, over its noise.
     """
 
     marks = 2.0
@@ -46,16 +46,16 @@ class SetLimits:
 
 @dataclass(frozen=True, eq=False)
 class SetSamples:
-    """The pictures of a set, before anything is fitted.
+    """Pictures of a set before the fit.
 
     Attributes:
         labels: labels of the pictures, for messages.
-        values: [K, H, W, C] linear, uint16 codes or float32 intensities; C is 1 where all pictures are gray.
-        exposures: exposures of the pictures: the angle in degrees, counter-clockwise as displayed, and the gain.
-        lost: [K, H, W], samples at full scale.
-        dark: [H, W], 0 in all pictures. masked: [H, W].
+        values: linear uint16 codes or float32 intensities, [K, H, W, C]; C is 1 if all pictures are gray.
+        exposures: exposures of the pictures: angle in degrees, counter-clockwise as displayed, and gain.
+        lost: mask of saturated samples, [K, H, W].
+        dark: mask of pixels that are 0 in all pictures, [H, W]. masked: mask of excluded pixels, [H, W].
         step: one stored value as a share of full scale.
-        notes: for the user.
+        notes: messages for the user.
     """
 
     labels: tuple[str, ...]
@@ -79,19 +79,19 @@ class SetSamples:
         return np.array([exposure.gain for exposure in self.exposures], np.float32)
 
     def intensities(self, at: Any) -> NDArray[np.float32]:
-        """Linear intensities on one exposure of some pixels, [K, ..., C]; ``at`` indexes [H, W]."""
+        """Return linear intensities of some pixels divided by the gains, [K, ..., C]; ``at`` indexes [H, W]."""
         chosen = self.values[(slice(None), *at)] if isinstance(at, tuple) else self.values[:, at]
         scale = np.float32(FULL_CODE) if self.values.dtype == np.uint16 else np.float32(1)
         gains = self.gains.reshape(-1, *[1] * (chosen.ndim - 1))
         return np.asarray(chosen.astype(np.float32) / (scale * gains))
 
     def gray(self, at: Any) -> NDArray[np.float32]:
-        """The same of the luminance, the plain mean of the colors: [K, ...]."""
+        """Return the luminance of ``intensities``, the mean of the colors, [K, ...]."""
         return mean_color(self.intensities(at))
 
 
 def mean_color(colors: NDArray[np.float32]) -> NDArray[np.float32]:
-    """The plain mean of one or three colors [..., C], contiguous: [...]. Written out: NumPy's mean of three is slow."""
+    """Return the mean of one or three colors [..., C] as a contiguous array [...]. NumPy's mean of three is slow."""
     if colors.shape[-1] == 1:
         return np.ascontiguousarray(colors[..., 0])
     return np.asarray((colors[..., 0] + colors[..., 1] + colors[..., 2]) / np.float32(3))
@@ -99,16 +99,16 @@ def mean_color(colors: NDArray[np.float32]) -> NDArray[np.float32]:
 
 @dataclass(frozen=True)
 class PictureFit:
-    """One picture of a set, compared with what the others predict.
+    """Comparison of one picture of a set with the prediction of the others.
 
     Attributes:
         label: its file, and frame of a video.
-        angle: that was fitted with: as stated, after sense, zero and orientation, degrees.
-        gain: by which its samples were divided.
-        looks_like: angle at which the others predict it best, degrees; None where the light does not tell.
-        error: standard error of ``looks_like``, degrees; None with it.
-        residual: root mean square of what the others leave unexplained, in full scales.
-        left_out: whether it was left out of the fit.
+        angle: angle of the fit in degrees, including sense, zero and orientation.
+        gain: divisor of the samples.
+        looks_like: angle with the best prediction, degrees; None if the light does not determine it.
+        error: standard error of ``looks_like``, degrees, or None.
+        residual: root mean square of the residuals, in full scales.
+        left_out: True if the picture is excluded from the fit.
     """
 
     label: str
@@ -122,7 +122,7 @@ class PictureFit:
 
 @dataclass(frozen=True)
 class SetJudgment:
-    """The comparison of the pictures of a set with one another.
+    """Comparison of the pictures of a set with each other.
 
     Attributes:
         pictures: the comparison of each picture with the others.
@@ -136,26 +136,20 @@ class SetJudgment:
 
 
 @dataclass(frozen=True)
-class _Prediction:
+class _Prediction(AngleEstimate):
     """Comparison of a picture with the Stokes vectors of the others.
 
     Attributes:
-        angle: apparent angle in degrees; None where the light does not tell.
-        error: standard error of the angle, degrees.
-        off: difference of the apparent angle from the stated one, degrees; 0 without an apparent angle.
         gain: brightness over the predicted one.
         residual: root mean square of the differences.
     """
 
-    angle: float | None
-    error: float
-    off: float
     gain: float
     residual: float
 
 
 def chosen_pixels(samples: SetSamples) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Rows and columns of pixels that are good in every picture, spread over the picture."""
+    """Return rows and columns of pixels that are usable in every picture, spread over the picture."""
     good = ~(samples.dark | samples.masked)
     for lost in samples.lost:
         good &= ~lost
@@ -165,14 +159,14 @@ def chosen_pixels(samples: SetSamples) -> tuple[NDArray[Any], NDArray[Any]]:
 
 
 def judge(samples: SetSamples, gray: Floats) -> SetJudgment:
-    """Compare the pictures of a set with one another, and choose those that are fitted.
+    """Compare the pictures of a set with each other, and choose the pictures for the fit.
 
     Each picture is fitted with Malus's law at an unknown angle and gain to the Stokes vectors of the others, over all
-    pixels at once. The picture with the largest deviation is left out, as long as enough others agree without it.
+    pixels at once. The picture with the largest deviation is excluded, as long as enough others agree without it.
 
     Args:
         samples: the set.
-        gray: luminance [K, N] at some pixels that are good in every picture.
+        gray: luminance [K, N] at pixels that are usable in every picture.
     """
     count = len(samples.labels)
     used = np.ones(count, bool)
@@ -180,58 +174,57 @@ def judge(samples: SetSamples, gray: Floats) -> SetJudgment:
     while gray.shape[1] >= SetLimits.fewest_pixels:
         predicted = _predictions(samples, gray, used, used)
         # Candidates: the picture with the largest residual, and the one with the largest error of its angle.
-        doubtful = (
+        candidates = (
             max(predicted, key=lambda k: predicted[k].residual),
-            max(predicted, key=lambda k: predicted[k].off),
+            max(predicted, key=lambda k: abs(predicted[k].off)),
         )
-        worst = next((k for k in doubtful if _contradicts(samples, gray, used, k, predicted[k])), None)
+        worst = next((k for k in candidates if _contradicts(samples, gray, used, k, predicted[k])), None)
         if worst is None:
             break
         used[worst] = False
         reasons[worst] = _reason(samples, worst, predicted[worst])
     notes = [reasons[k] for k in sorted(reasons)]
     final = _predictions(samples, gray, used, np.ones(count, bool))
-    off_by = [final[k].off for k in np.flatnonzero(used).tolist() if final[k].angle is not None]
+    off_by = [abs(final[k].off) for k in np.flatnonzero(used).tolist() if final[k].angle is not None]
     if count > 3 and off_by and np.median(off_by) > SetLimits.marks:
         notes.append(
-            f"The angles contradict one another by {np.median(off_by):.0f} degrees (median); "
-            f"{int(used.sum())} pictures do not tell which are wrong."
+            f"The angles contradict each other by {np.median(off_by):.0f} degrees (median). "
+            f"{int(used.sum())} pictures are too few to identify the wrong ones."
         )
     fits = tuple(
         PictureFit(
             label=samples.labels[k],
             angle=samples.exposures[k].angle or 0.0,
             gain=samples.exposures[k].gain,
-            looks_like=None if found.angle is None else round(found.angle, 1),
-            error=None if found.angle is None else found.error,
-            residual=found.residual,
+            looks_like=None if fit.angle is None else round(fit.angle, 1),
+            error=None if fit.angle is None else fit.error,
+            residual=fit.residual,
             left_out=not used[k],
         )
-        for k, found in final.items()
+        for k, fit in final.items()
     )
     return SetJudgment(fits, used, tuple(notes))
 
 
 def _contradicts(samples: SetSamples, gray: Floats, used: Mask, worst: int, predicted: _Prediction) -> bool:
-    """Return true if a picture is far further from the others, by angle or residual, than they are from one another."""
+    """Return True if angle or residual of a picture deviates far more than those of the other pictures."""
     rows = samples.rows.astype(np.float64)
     rest = used.copy()
     rest[worst] = False
     if rest.sum() < 4 or conditioning(torch.from_numpy(2 * rows[rest, 1:])) < WELL_CONDITIONED:
         return False
     others = _predictions(samples, gray, rest, rest).values()
-    typical = float(np.median([other.off for other in others]))
-    left = float(np.median([other.residual for other in others]))
+    typical = float(np.median([abs(other.off) for other in others]))
+    residual = float(np.median([other.residual for other in others]))
     return (
-        predicted.off > tolerance(SetLimits.marks, 0.0, typical)
-        or predicted.residual > SetLimits.against * left
+        predicted.contradicts(SetLimits.marks, typical) or predicted.residual > SetLimits.against * residual
     )
 
 
 def _reason(samples: SetSamples, k: int, predicted: _Prediction) -> str:
     """Return the reason why a picture is rejected, for the user."""
     change = predicted.gain - 1
-    if predicted.angle is not None and predicted.off > SetLimits.marks:
+    if predicted.angle is not None and abs(predicted.off) > SetLimits.marks:
         reason = f"looks like {predicted.angle:.0f} degrees: its angle is probably wrong"
     elif abs(change) > SetLimits.brighter:
         way = "brighter" if change > 0 else "darker"
@@ -241,35 +234,36 @@ def _reason(samples: SetSamples, k: int, predicted: _Prediction) -> str:
     return f"{samples.labels[k]} ({samples.exposures[k].angle or 0.0:g} degrees) {reason}. It is left out."
 
 
-def _predictions(samples: SetSamples, gray: Floats, used: Mask, asked: Mask) -> dict[int, _Prediction]:
-    """Compare each picture in ``asked`` with those in ``used`` other than itself."""
+def _predictions(samples: SetSamples, gray: Floats, used: Mask, chosen: Mask) -> dict[int, _Prediction]:
+    """Compare each picture in ``chosen`` with the other pictures in ``used``, by index."""
     rows = samples.rows.astype(np.float64)
-    found = {}
-    for k in np.flatnonzero(asked).tolist():
+    predicted = {}
+    for k in np.flatnonzero(chosen).tolist():
         others = used.copy()
         others[k] = False
-        found[k] = _predicted(rows, gray, others, k, samples.exposures[k].angle or 0.0)
-    return found
+        predicted[k] = _predict(rows, gray, others, k, samples.exposures[k].angle or 0.0)
+    return predicted
 
 
-def _predicted(rows: Floats, gray: Floats, others: Mask, k: int, stated: float) -> _Prediction:
+def _predict(rows: Floats, gray: Floats, others: Mask, k: int, stated: float) -> _Prediction:
     """Predict one picture from the others, by least squares over angle and gain.
 
-    With m = (1, cos 2t, sin 2t) / 2 times the Stokes vector, the angle t has the least sum of (I - g m)^2. Moments of
-    the Stokes vectors are taken without what noise adds to them, or unpolarized light would tell an angle.
+    With m = (1, cos 2t, sin 2t) / 2 times the Stokes vector, the angle t has the least sum of (I - g m)^2. The
+    contribution of noise is subtracted from the moments of the Stokes vectors. Otherwise, unpolarized light would seem
+    to determine an angle.
     """
-    if not gray.shape[1]:  # some picture clips everywhere
-        return _Prediction(None, math.inf, 0.0, 1.0, 0.0)
+    if not gray.shape[1]:  # a picture is saturated at every pixel
+        return _Prediction(None, math.inf, stated, 1.0, 0.0)
     inverse = np.linalg.pinv(rows[others])
     stokes = inverse @ gray[others]
     picture = gray[k]
     pixels = picture.size
-    left = gray[others] - rows[others] @ stokes
+    residuals = gray[others] - rows[others] @ stokes
     freedom = int(others.sum()) - 3
     leverage = float(((rows[k] @ inverse) ** 2).sum())
     residual = math.sqrt(float(np.mean((picture - rows[k] @ stokes) ** 2)) / (1 + leverage))
-    # Robust: a few pixels that moved do not make all of them noisy. Without redundancy, the picture's own residual.
-    noise = residual**2 if freedom < 1 else typical_variance((left**2).sum(axis=0), freedom)
+    # A robust estimate, so that a few moving pixels do not matter. Without redundancy, the residual of this picture.
+    noise = residual**2 if freedom < 1 else typical_variance((residuals**2).sum(axis=0), freedom)
     extra = noise * inverse @ inverse.T / 4
     moments = stokes @ stokes.T / (4 * pixels) - extra
     product = stokes @ picture / (2 * pixels)
@@ -286,10 +280,8 @@ def _predicted(rows: Floats, gray: Floats, others: Mask, k: int, stated: float) 
     error = math.inf
     if certain:
         error = math.degrees(math.sqrt(noise * (1 + leverage) / (pixels * spread)) / float(gain[best]))
-    if error >= SetLimits.determined:
-        return _Prediction(None, error, 0.0, float(gain[best]), residual)
-    angle = float(angles[best])
-    return _Prediction(angle, error, abs(angle_difference(angle, stated)), float(gain[best]), residual)
+    angle = float(angles[best]) if error < SetLimits.determined else None
+    return _Prediction(angle, error, stated, float(gain[best]), residual)
 
 
 def typical_variance(squares: Floats, freedom: int) -> float:

@@ -1,4 +1,4 @@
-"""Exposures of pictures by the brightness of points that they have in common, with the errors of these exposures."""
+"""Exposures of pictures from the brightness of shared points, with standard errors."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ from polarguide.geometry.camera import Camera
 
 Array = NDArray[np.floating[Any]]
 FEWEST = 20
-"""Points of which fewer say nothing about a picture."""
+"""Smallest number of points that determines the exposure of a picture."""
 MOST_POINTS = 20_000
-"""Points that are compared, those with the longest tracks."""
+"""Largest number of points that are compared. Points with the longest tracks are preferred."""
 _LEAST_TRACK = 3
 _ROUNDS = 40
 _SETTLED = 1e-4
-# Residuals of logarithms that are no smaller than noise and rounding.
+# Smallest residual of a logarithm, from noise and rounding.
 _SMALLEST = 0.03
-# Times that space is halved, as far as pictures keep FEWEST points in most parts.
+# Number of bisections of space. Pictures need FEWEST points in most parts.
 _LEAST_DIVISIONS = 2
 _MOST_DIVISIONS = 4
-# Probability that exposures which are all equal are called different.
+# Probability of a false alarm if all exposures are equal.
 _FALSE_ALARM = 0.01
 _ERRORS = 2.0
-# Linear intensity below which noise and rounding of 8 bits hide the exposure.
+# Linear intensity below which noise and 8-bit rounding hide the exposure.
 _DARK = 0.004
 _FULL = 65535.0
 
@@ -42,10 +42,10 @@ class PointExposures:
     """Exposures of pictures.
 
     Attributes:
-        logs: logarithms, [V, C] of C channels, mean 0; NaN for pictures with fewer than ``FEWEST`` points that they
-            share with those of the largest connected set.
-        errors: of their means over the channels, [V]; infinite where they cannot be told.
-        color_errors: of what the channels deviate from these means, [V].
+        logs: logarithms [V, C] of C channels, with mean 0. NaN for pictures with fewer than ``FEWEST`` points, or
+            outside the largest set of pictures that points connect.
+        errors: standard errors of the means over the channels, [V]; infinite if unknown.
+        color_errors: standard errors of the deviations of the channels from these means, [V].
         points: number of points of each picture, [V].
     """
 
@@ -56,27 +56,33 @@ class PointExposures:
 
     @property
     def significant(self) -> Array:
-        """The logarithms, [V, C], without what is not significant; NaN where they are not known.
+        """Significant logarithms [V, C]; NaN for unknown exposures.
 
-        Brightness and color are judged apart. Either is 0 in all pictures unless one of them differs from the mean with
-        a probability of error of 1 % over all pictures; then it is 0 in pictures within two errors of the mean.
+        Brightness and color are tested separately. A value is 0 in all pictures unless one of them differs from the
+        mean with a false-alarm probability of 1 % over all pictures. Then it is 0 only in pictures within two standard
+        errors of the mean.
         """
         bright = self.logs.mean(axis=1)
         color = self.logs - bright[:, None]
         strongest = np.abs(color).max(axis=1)
-        told = np.where(significant(np.abs(bright), self.errors), bright, 0.0)[:, None]
-        tinted = np.where(significant(strongest, self.color_errors)[:, None], color, 0.0)
-        return np.where(np.isfinite(self.logs), told + tinted, np.nan)
+        common = np.where(significant(np.abs(bright), self.errors), bright, 0.0)[:, None]
+        tint = np.where(significant(strongest, self.color_errors)[:, None], color, 0.0)
+        return np.where(np.isfinite(self.logs), common + tint, np.nan)
 
     def gains(self) -> list[tuple[float, float, float]]:
-        """The significant gains of R, G and B of each picture; 1 where they are not known."""
+        """Return the significant gains of R, G and B of each picture; 1 for unknown exposures."""
         return [
             (float(r), float(g), float(b)) for r, g, b in np.exp(np.nan_to_num(self.significant)).round(6)
         ]
 
 
 def significant(sizes: Array, errors: Array) -> NDArray[np.bool_]:
-    """Which sizes of differences, [V], are significant, see ``PointExposures.significant``."""
+    """Return a mask of the significant differences, [V], as described in ``PointExposures.significant``.
+
+    Args:
+        sizes: absolute differences, [V].
+        errors: standard errors of the differences, [V].
+    """
     known = np.isfinite(sizes)
     limit = NormalDist().inv_cdf(1 - _FALSE_ALARM / (2 * max(1, int(known.sum()))))
     with np.errstate(invalid="ignore"):
@@ -85,18 +91,18 @@ def significant(sizes: Array, errors: Array) -> NDArray[np.bool_]:
 
 
 def exposures_of_points(values: Array, places: Array) -> PointExposures:
-    """Exposures of pictures from intensities of points.
+    """Estimate exposures of pictures from intensities of points.
 
-    Solves ``log(value) = exposure of the picture + brightness of the point`` with the least sum of absolute residuals
-    (iteratively reweighted least squares), where a point counts less the more its own residuals scatter: reflections
-    and polarization make points look different from picture to picture, and matte ones tell exposures best.
+    The model is ``log(value) = exposure of the picture + brightness of the point``. The sum of absolute residuals is
+    minimized by iteratively reweighted least squares. Points with scattered residuals get small weights, because
+    reflections and polarization change their brightness between pictures.
 
-    Parts of space are solved alone, too. The error of an exposure is the standard deviation over these parts, however
-    many there are: more of them do not make it smaller, because the reflections that mislead them are of one light.
+    Parts of space are also solved separately. The error of an exposure is the standard deviation over these parts. It
+    does not decrease with their number, because the reflections in all parts come from the same light.
 
     Args:
-        values: [points, pictures, channels] positive linear intensities; NaN where a point is not seen or not measured.
-        places: [points, 3] where the points are.
+        values: positive linear intensities [points, pictures, channels]; NaN for missing measurements.
+        places: positions of the points, [points, 3].
     """
     count, channels = values.shape[1:]
     unknown = np.full((count, channels), np.nan)
@@ -112,7 +118,7 @@ def exposures_of_points(values: Array, places: Array) -> PointExposures:
     if len(chosen) < 2:
         return PointExposures(unknown, errors[0], errors[1], numbers)
     logs = unknown.copy()
-    logs[chosen] = _solved(values[:, chosen])
+    logs[chosen] = _solve(values[:, chosen])
     divisions = int(np.log2(max(1.0, float(np.median(numbers[chosen])) / FEWEST)))
     errors[:, chosen] = _errors(
         values[:, chosen],
@@ -123,12 +129,12 @@ def exposures_of_points(values: Array, places: Array) -> PointExposures:
 
 
 def _measured(values: Array) -> NDArray[np.bool_]:
-    """Where all channels [..., C] are measured."""
+    """Return a mask of values [..., C] that are finite in all channels."""
     return np.asarray(np.isfinite(values).all(axis=-1), np.bool_)
 
 
 def _connected(valid: NDArray[np.bool_], fewest: int) -> NDArray[np.int64]:
-    """The pictures of the largest set in which any two are linked by points in common."""
+    """Return the indices of the largest set of pictures that shared points connect."""
     enough = np.flatnonzero(valid.sum(axis=0) >= fewest)
     if len(enough) == 0:
         return enough
@@ -137,20 +143,20 @@ def _connected(valid: NDArray[np.bool_], fewest: int) -> NDArray[np.int64]:
     return enough[group == np.argmax(np.bincount(group))]
 
 
-def _solved(values: Array) -> Array:
-    """Logarithms of the exposures of connected pictures, [V, C], mean 0."""
+def _solve(values: Array) -> Array:
+    """Return the logarithms of the exposures of connected pictures, [V, C], with mean 0."""
     valid = _measured(values)
     paired = valid.sum(axis=1) >= 2
     point, picture = np.nonzero(valid[paired])
     logs = np.log(values[paired][point, picture].astype(np.float64))
     size = int(paired.sum()), values.shape[1]
-    return np.stack([_solved_channel(log, point, picture, size) for log in logs.T], axis=1)
+    return np.stack([_solve_channel(log, point, picture, size) for log in logs.T], axis=1)
 
 
-def _solved_channel(
+def _solve_channel(
     log: Array, point: NDArray[np.int64], picture: NDArray[np.int64], size: tuple[int, int]
 ) -> Array:
-    """The exposures of one channel from logarithms of intensities at pairs of point and picture."""
+    """Solve for the exposures of one channel from logarithms of intensities at pairs of point and picture."""
     rows, columns = size
     tracks = np.bincount(point, minlength=rows)
     weights = np.ones(len(log))
@@ -158,7 +164,7 @@ def _solved_channel(
     for _ in range(_ROUNDS):
         before = solution
         total = np.bincount(point, weights, rows)
-        # The points' brightnesses are eliminated; adding a constant fixes the mean of the exposures at 0.
+        # Eliminate the brightness of the points. A constant on all entries fixes the mean of the exposures at 0.
         matrix = coo_array((weights, (point, picture)), size).tocsr()
         share = coo_array((weights / total[point], (point, picture)), size).tocsr()
         normal = np.diag(np.bincount(picture, weights, columns)) - (matrix.T @ share).toarray()
@@ -177,31 +183,31 @@ def _solved_channel(
 
 
 def _parts(places: Array, divisions: int) -> NDArray[np.int64]:
-    """The part of space of each point, [M]: halved across the longest side, again and again."""
+    """Return the part index of each point, [M], by repeated bisection along the longest side."""
     parts = np.zeros(len(places), np.int64)
     for _ in range(divisions):
         halved = 2 * parts
         for part in np.unique(parts):
-            mine = np.flatnonzero(parts == part)
-            axis = int(np.argmax(np.subtract(*np.percentile(places[mine], (90, 10), axis=0))))
-            halved[mine] += places[mine, axis] > np.median(places[mine, axis])
+            members = np.flatnonzero(parts == part)
+            axis = int(np.argmax(np.subtract(*np.percentile(places[members], (90, 10), axis=0))))
+            halved[members] += places[members, axis] > np.median(places[members, axis])
         parts = halved
     return parts
 
 
 def _errors(values: Array, parts: NDArray[np.int64], logs: Array) -> Array:
-    """Standard deviations over parts of space, weighted by their numbers of points: of brightness and color, [2, V]."""
+    """Return standard deviations of brightness and color over parts of space, weighted by their points, [2, V]."""
     squares = np.zeros((2, len(logs)))
     total = np.zeros(len(logs))
     used = np.zeros(len(logs), np.int64)
     for part in np.unique(parts):
-        mine = values[parts == part]
-        seen = _measured(mine)
-        chosen = _connected(seen, FEWEST // 4)
+        members = values[parts == part]
+        valid = _measured(members)
+        chosen = _connected(valid, FEWEST // 4)
         if len(chosen) < 2:
             continue
-        number = seen[:, chosen].sum(axis=0)
-        off = _solved(mine[:, chosen]) - logs[chosen]
+        number = valid[:, chosen].sum(axis=0)
+        off = _solve(members[:, chosen]) - logs[chosen]
         off -= np.median(off, axis=0)
         bright = off.mean(axis=1)
         color = np.abs(off - bright[:, None]).max(axis=1)
@@ -211,7 +217,7 @@ def _errors(values: Array, parts: NDArray[np.int64], logs: Array) -> Array:
     errors = np.full((2, len(logs)), np.inf)
     enough = used > 1
     errors[:, enough] = np.sqrt(squares[:, enough] / total[enough] * used[enough] / (used[enough] - 1))
-    # Errors of few parts are uncertain themselves: none is taken to be smaller than usual.
+    # Errors from few parts are uncertain. The median is their lower bound.
     return np.maximum(errors, np.median(errors, axis=1, keepdims=True))
 
 
@@ -220,7 +226,7 @@ class PointSamples:
     """Intensities of pictures around the projections of points.
 
     Attributes:
-        values: means over 3 x 3 pixels, linear, [N, K, 3]; NaN outside and beside bad pixels.
+        values: linear means over 3 x 3 pixels, [N, K, 3]; NaN outside the picture and next to bad pixels.
         peaks: largest stored values of these pixels, [N].
     """
 
@@ -238,7 +244,9 @@ def samples_at(
     """Sample K stored pictures [H, W, 3] of one view at points.
 
     Args:
-        places: [N, 3]. camera: at the size of the pictures. bad: pixels without use, [H, W]. transfer: the encoding.
+        places: positions of the points, [N, 3]. camera: camera at the size of the pictures.
+        pictures: stored values of the pictures.
+        bad: mask of unusable pixels, [H, W]. transfer: encoding of the pictures.
     """
     local = places @ camera.rotation.numpy().T + camera.translation.numpy()
     depth = np.where(local[:, 2] > 0, local[:, 2], np.nan)
@@ -261,9 +269,9 @@ def samples_at(
 
 
 def matte(values: Array) -> Array:
-    """Half of the unpolarized light, (S0 - |(S1, S2)|) / 2, of four angles [N, 4, C]: it has less of the reflections.
+    """Return half of the unpolarized light, (S0 - |(S1, S2)|) / 2, of four angles [N, 4, C]; NaN for little light.
 
-    NaN where hardly any is left.
+    Unpolarized light contains fewer reflections.
     """
     first = values[:, 0] - values[:, 2], values[:, 1] - values[:, 3]
     least = values.mean(axis=1) - np.hypot(*first) / 2
@@ -272,10 +280,11 @@ def matte(values: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class ComparedPoints:
-    """The points of a model by which the exposures of its views are compared.
+    """Points of a model by which the exposures of its views are compared.
 
     Attributes:
-        model: the model. places: [N, 3]. columns: views by name. observed: which views observe each point, [N, V].
+        model: the model. places: positions, [N, 3]. columns: index of each view by name.
+        observed: mask of the points that each view observes, [N, V].
     """
 
     model: ColmapModel
@@ -285,7 +294,7 @@ class ComparedPoints:
 
     @classmethod
     def of(cls, model: ColmapModel, views: Sequence[str]) -> ComparedPoints | None:
-        """The points with the longest tracks; None where no tracks are stored."""
+        """Select the points with the longest tracks; None if the model stores no tracks."""
         observed = model.observations(views).numpy()
         longest = np.argsort(-observed.sum(axis=1), kind="stable")[:MOST_POINTS]
         observed = observed[longest]
@@ -301,7 +310,7 @@ class ComparedPoints:
     def samples(
         self, view: str, raw: Sequence[NDArray[Any]], bad: NDArray[np.bool_] | None, transfer: str
     ) -> PointSamples | None:
-        """Samples of a view's stored pictures at the points that it observes; None without a pose."""
+        """Sample a view's stored pictures at the points that it observes; None without a pose."""
         if view not in self.columns:
             return None
         height, width = raw[0].shape[:2]
@@ -314,15 +323,15 @@ class ComparedPoints:
         )
 
     def exposures(self, samples: Mapping[str, PointSamples | None], full_scale: int | None) -> PointExposures:
-        """Exposures of views of four angles, in their order.
+        """Estimate the exposures of views of four angles, in their order.
 
         Args:
-            samples: by view; None without a pose. full_scale: stored value at which they saturate, if they do.
+            samples: samples by view; None without a pose. full_scale: stored value of saturated pixels, or None.
         """
         values = np.full((len(self.places), len(samples), 3), np.nan, np.float32)
         for place, (view, sampled) in enumerate(samples.items()):
             if sampled is not None:
                 fine = sampled.peaks < (np.inf if full_scale is None else full_scale)
-                seen = self.observed[:, self.columns[view]]
-                values[seen, place] = np.where(fine[:, None], matte(sampled.values), np.nan)
+                observed = self.observed[:, self.columns[view]]
+                values[observed, place] = np.where(fine[:, None], matte(sampled.values), np.nan)
         return exposures_of_points(values, self.places)

@@ -1,7 +1,7 @@
-"""Cameras of ``transforms.json``: nerfstudio's, instant-ngp's and Blender's.
+"""Cameras of pose files: ``transforms.json`` (nerfstudio, instant-ngp, Blender), XML of Metashape, ``.npz`` of IDR.
 
-Fields and their meaning: docs/reference/formats.md has each. A field that changes the meaning of numbers is used or
-refused; one that is not known is warned of by name.
+docs/reference/formats.md describes each field. A field that changes the meaning of numbers is used or refused. An
+unknown field causes a warning.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ import functools
 import math
 import warnings
 import xml.etree.ElementTree as ElementTree
+from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -34,14 +35,16 @@ from polarguide.core.text import listed, number_or_nan
 
 Size = tuple[int, int]
 Sizes = Callable[[str], tuple[Size, ...]]
-"""View -> sizes (width, height) that its camera may have been made for, the likeliest first; none where unknown."""
-# Share of a side by which principal points lie off the middle: lenses miss it by some percent, while those of pictures
-# of half the size lie a quarter off.
+"""Function that lists the possible sizes (width, height) of a view's camera, the likeliest first."""
 _OFF_CENTER = 0.125
+"""Largest offset of a principal point from the center, as a share of the side.
+
+Lenses are off by some percent. A principal point of pictures of half the size is off by a quarter.
+"""
 
 
 def is_centered(size: Size, center: tuple[float | None, float | None]) -> bool:
-    """Return True if the known coordinates of a principal point lie near the middle of the picture."""
+    """Return True if the known coordinates of a principal point are near the center of the picture."""
     return all(
         place is None or abs(place - side / 2) <= _OFF_CENTER * side
         for place, side in zip(center, size, strict=True)
@@ -51,38 +54,38 @@ def is_centered(size: Size, center: tuple[float | None, float | None]) -> bool:
 def settled_size(
     where: object, sizes: Sequence[Size], center: tuple[float | None, float | None], *, in_pixels: bool
 ) -> Size:
-    """The size whose middle the principal point lies near.
+    """Return the size whose center is near the principal point.
 
     Args:
-        where: for messages.
-        sizes: that it may be, the likeliest first.
-        center: the principal point, as far as it is known.
-        in_pixels: whether other numbers of the camera are in pixels, too, and mean nothing without the right size.
+        where: place for messages.
+        sizes: possible sizes, the likeliest first.
+        center: principal point, None for an unknown coordinate.
+        in_pixels: if True, other numbers of the camera are in pixels and depend on the size.
 
     Raises:
-        PolarguideError: no size is known, the principal point fits none, or several fit.
+        PolarguideError: no size is known, no size fits the principal point, or several do.
     """
     expected = "width and height of the pictures that the camera was made for, w and h"
     require_camera(sizes, where, expected, "none")
     fitting = [size for size in sizes if is_centered(size, center)]
-    named = " or ".join(f"{width}x{height}" for width, height in sizes)
-    if not fitting:
-        raise wrong_camera(
-            where, f"a principal point near the middle of {named}", f"{center[0]}, {center[1]}"
-        )
+    text = " or ".join(f"{width}x{height}" for width, height in sizes)
+    require_camera(
+        fitting, where, f"a principal point near the middle of {text}", f"{center[0]}, {center[1]}"
+    )
     areas = {width * height for width, height in fitting}
-    require_camera(len(areas) == 1 or not in_pixels, where, expected, f"none, for pictures of {named}")
+    require_camera(len(areas) == 1 or not in_pixels, where, expected, f"none, for pictures of {text}")
     return fitting[0]
 
 
 _SQUARE = ((3, 4), (4, 4))
-# The cameras look along -z with y up.
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+"""Change of axes for cameras that look along -z with y up."""
 _PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 _FISHEYE = "OPENCV_FISHEYE"
 MOST_FRAMES = 20_000
-# Two statements of one focal length differ by rounding; a file of pictures that were resized later by far more.
+"""Largest number of frames of a file."""
 _SAME_FOCAL = 0.01
+"""Relative difference of equal focal lengths. Rounding causes less, resized pictures far more."""
 
 
 _NUMBERS = (
@@ -97,7 +100,7 @@ _LENS: dict[str, Any] = {
     "is_fisheye": bool | None,
     "intrinsic_matrix": list[list[float]] | None,
 }
-"""Fields that describe a lens, for all frames or for one, and their types."""
+"""Types of the fields of a lens, for all frames or for one."""
 _Lens: Any = msgspec.defstruct("_Lens", [(name, kind, None) for name, kind in _LENS.items()])
 
 
@@ -116,7 +119,7 @@ class _Transforms(_Lens):
     from_na: bool | None = None
 
 
-# Fields that change no camera: placement of the scene, training, depth, masks and points.
+# Fields without influence on a camera: placement of the scene, training, depth, masks and points.
 _IRRELEVANT = {
     "aabb", "aabb_scale", "render_aabb", "scale", "offset", "up", "applied_transform", "applied_scale",
     "orientation_override", "auto_scale_poses_override", "centered", "ply_file_path", "n_frames",
@@ -131,24 +134,28 @@ _IRRELEVANT = {
 
 
 def read_transforms(path: Path, views: Collection[str], sizes: Sizes) -> dict[str, PosedCamera]:
-    """Cameras by the views that the names of the frames' files mean.
+    """Read the cameras of a ``transforms.json`` by the views of the frames' file names.
 
     Args:
-        path: the file.
+        path: path of the file.
         views: names of the capture's views.
-        sizes: what a view's camera may have been made for, where the file does not say.
+        sizes: possible sizes of a view's camera for files without a size.
 
     Raises:
-        PolarguideError: the file cannot be read, or a field names a camera that is not read.
+        PolarguideError: the file cannot be read, or has a camera of an unsupported kind.
     """
     remedy = "Export transforms.json again."
     content = parse(read_file(path, largest=LARGEST_RECORD, remedy=remedy), path, remedy=remedy)
     record = decode(content, _Transforms, path, remedy=remedy)
     listed_frames = [frame for key in ("frames", "test_frames") for frame in content.get(key, ())]
     names = set(content).union(*listed_frames)
-    if record.camera is not None or record.normal_mts_args is not None:
-        name = "camera" if record.camera is not None else "normal_mts_args"
-        raise wrong_camera(path, "cameras that look along -z with y up (OpenGL)", f"{name}, of other axes")
+    for name in ("camera", "normal_mts_args"):
+        require_camera(
+            getattr(record, name) is None,
+            path,
+            "cameras that look along -z with y up (OpenGL)",
+            f"{name}, of other axes",
+        )
     cameras: dict[str, PosedCamera] = {}
     for number, frame in enumerate((*record.frames, *record.test_frames)):
         where = f"{path} (frame {number}, {frame.file_path})"
@@ -161,7 +168,7 @@ def read_transforms(path: Path, views: Collection[str], sizes: Sizes) -> dict[st
         view = view_of_name(frame.file_path, views)
         require_camera(view not in cameras, where, f"one frame called {view}", "two")
         lens = _lens_of(where, frame, record)
-        # NeuS2 says by ``from_na`` that its axes are right, down, forward.
+        # ``from_na`` of NeuS2 means axes right, down, forward.
         to_world = _pose_of(where, frame) @ (np.eye(4) if record.from_na else _OPENGL)
         cameras[view] = _camera_of(where, lens, to_world, functools.partial(sizes, view))
     known = {*_Transforms.__struct_fields__, *_Frame.__struct_fields__, *_IRRELEVANT}
@@ -175,25 +182,24 @@ _COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2")
 
 
 def _lens_of(where: str, frame: Any, record: Any) -> dict[str, Any]:
-    """The fields of a frame's lens: its own, else those of the file; ``intrinsic_matrix`` as the four numbers it holds.
+    """Collect the fields of a frame's lens, with defaults from the file; ``intrinsic_matrix`` becomes four numbers.
 
-    Focal lengths and coefficients are statements as a whole: a frame that makes one takes nothing of the file's.
+    A frame that has one field of the focal length uses no such field of the file. The same holds for coefficients.
 
     Raises:
-        PolarguideError: the matrix is no camera matrix, or stands beside other numbers.
+        PolarguideError: ``intrinsic_matrix`` is invalid, or other fields specify the intrinsics again.
     """
     lens = {name: getattr(frame, name) for name in _LENS}
-    whole = (_FOCAL, (*_COEFFICIENTS, "distortion_params"))
-    stated = {name for names in whole if any(lens[n] is not None for n in names) for name in names}
+    groups = (_FOCAL, (*_COEFFICIENTS, "distortion_params"))
+    stated = {name for names in groups if any(lens[n] is not None for n in names) for name in names}
     used = {
         name: getattr(record, name) if own is None and name not in stated else own
         for name, own in lens.items()
     }
     if used["intrinsic_matrix"] is None:
         return used
-    beside = {name: used[name] for name in (*_FOCAL, *_MATRIX) if name != "intrinsic_matrix"}
-    named = [name for name, number in beside.items() if number is not None]
-    require_camera(not named, where, "intrinsic_matrix alone", f"{', '.join(named)} beside it")
+    others = [name for name in (*_FOCAL, *_MATRIX) if name != "intrinsic_matrix" and used[name] is not None]
+    require_camera(not others, where, "intrinsic_matrix alone", f"also {', '.join(others)}")
     matrix = finite_numbers(where, used["intrinsic_matrix"], ((3, 3), *_SQUARE))[:3, :3]
     inner = checked_intrinsics(where, matrix)
     numbers = (inner[0, 0], inner[1, 1], inner[0, 2], inner[1, 2])
@@ -201,7 +207,7 @@ def _lens_of(where: str, frame: Any, record: Any) -> dict[str, Any]:
 
 
 def _pose_of(where: str, frame: _Frame) -> Any:
-    """The matrix from the camera to the world, [4, 4], with the axes of the file."""
+    """Return the matrix from camera to world, [4, 4], with the axes of the file."""
     matrices = [
         matrix
         for matrix in (frame.transform_matrix, frame.transform_matrix_start, frame.transform_matrix_end)
@@ -211,7 +217,7 @@ def _pose_of(where: str, frame: _Frame) -> Any:
     require_camera(
         all(np.allclose(numbers[0], other) for other in numbers[1:]),
         where,
-        "a camera that stands still",
+        "a camera that does not move",
         "transform_matrix_start and transform_matrix_end that differ",
     )
     return np.vstack([numbers[0], [0, 0, 0, 1]])
@@ -220,7 +226,7 @@ def _pose_of(where: str, frame: _Frame) -> Any:
 def _camera_of(
     where: str, lens: Mapping[str, Any], to_world: Any, sizes: Callable[[], Sequence[Size]]
 ) -> PosedCamera:
-    """The camera of a frame."""
+    """Create the camera of a frame."""
     fisheye = _is_fisheye(where, lens)
     coefficients = _distortion(where, lens, fisheye)
     center = (lens["cx"], lens["cy"])
@@ -236,39 +242,36 @@ def _camera_of(
 
 
 def _is_fisheye(where: str, lens: Mapping[str, Any]) -> bool:
-    """Return True for a fisheye lens of OpenCV, and False for a perspective one.
+    """Return True for a fisheye lens of OpenCV, and False for a perspective lens.
 
     Raises:
-        PolarguideError: the lens is a panorama or another lens that is not read, or fields contradict one another.
+        PolarguideError: the lens is unsupported, such as a panorama, or fields contradict one another.
     """
     model = lens["camera_model"]
     expected = f"a camera of {', '.join(_PERSPECTIVE)} or {_FISHEYE}"
-    others = ("latlong", "equirectangular", "ftheta_p0", "fisheye_crop_radius", "k5", "k6")
-    named = next((name for name in others if lens[name]), None)
-    if named is not None:
-        raise wrong_camera(where, expected, f"{named} {lens[named]}")
+    for name in ("latlong", "equirectangular", "ftheta_p0", "fisheye_crop_radius", "k5", "k6"):
+        require_camera(not lens[name], where, expected, f"{name} {lens[name]}")
     require_camera(
         not (any(lens["rolling_shutter"] or ()) or lens["rolling_shutter_time"]),
         where,
         "a shutter that opens for all rows at once",
         "rolling_shutter",
     )
-    if model is not None and model not in (*_PERSPECTIVE, _FISHEYE):
-        raise wrong_camera(where, expected, model)
-    if lens["is_fisheye"] is not None and model is not None and lens["is_fisheye"] != (model == _FISHEYE):
-        raise wrong_camera(
-            where,
-            "camera_model and is_fisheye that agree",
-            f"{model} with is_fisheye {str(lens['is_fisheye']).lower()}",
-        )
+    require_camera(model is None or model in (*_PERSPECTIVE, _FISHEYE), where, expected, model)
+    require_camera(
+        lens["is_fisheye"] is None or model is None or lens["is_fisheye"] == (model == _FISHEYE),
+        where,
+        "camera_model and is_fisheye that agree",
+        f"{model} with is_fisheye {str(lens['is_fisheye']).lower()}",
+    )
     return bool(lens["is_fisheye"]) or model == _FISHEYE
 
 
 def _distortion(where: str, lens: Mapping[str, Any], fisheye: bool) -> list[float]:
-    """k1, k2, p1, p2 and k3 of a perspective camera, k1 to k4 of a fisheye.
+    """Return k1, k2, p1, p2 and k3 of a perspective camera, or k1 to k4 of a fisheye.
 
     Raises:
-        PolarguideError: there are others, or two statements differ.
+        PolarguideError: the lens has other coefficients, or two fields differ.
     """
     coefficients = [lens[name] for name in _COEFFICIENTS]
     value = [float(number or 0.0) for number in coefficients]
@@ -280,12 +283,12 @@ def _distortion(where: str, lens: Mapping[str, Any], fisheye: bool) -> list[floa
             "six distortion_params: k1, k2, k3, k4, p1, p2",
             f"{len(params)} numbers",
         )
-        if any(own is not None and own != other for own, other in zip(coefficients, params, strict=True)):
-            raise wrong_camera(
-                where,
-                "distortion_params that agree with k1 to p2",
-                f"{params} beside {dict(zip(_COEFFICIENTS, coefficients, strict=True))}",
-            )
+        require_camera(
+            all(own is None or own == other for own, other in zip(coefficients, params, strict=True)),
+            where,
+            "distortion_params that agree with k1 to p2",
+            f"{params} and {dict(zip(_COEFFICIENTS, coefficients, strict=True))}",
+        )
         value = [float(number) for number in params]
     k1, k2, k3, k4, p1, p2 = value
     if fisheye:
@@ -298,10 +301,10 @@ def _distortion(where: str, lens: Mapping[str, Any], fisheye: bool) -> list[floa
 
 
 def _stated_size(where: str, lens: Mapping[str, Any]) -> tuple[int, int] | None:
-    """Width and height that the file states; None where it has neither.
+    """Return width and height of the file; None if it has no size.
 
     Raises:
-        PolarguideError: the file has one of the two, or a size that no picture has.
+        PolarguideError: the file has only one of the two, or an invalid size.
     """
     width = lens["w"]
     height = lens["h"]
@@ -319,10 +322,10 @@ def _stated_size(where: str, lens: Mapping[str, Any]) -> tuple[int, int] | None:
 def _focal_lengths(
     where: str, lens: Mapping[str, Any], size: tuple[int, int], fisheye: bool
 ) -> tuple[float, float]:
-    """Focal lengths in x and y: in pixels, by an angle of view in radians, or in degrees.
+    """Return the focal lengths in x and y from lengths in pixels or angles of view in radians or degrees.
 
     Raises:
-        PolarguideError: no value is positive, or two values differ.
+        PolarguideError: a value is not positive, all are missing, or two values differ.
     """
     lengths: list[float | None] = []
     for axis, side in zip("xy", size, strict=True):
@@ -331,10 +334,12 @@ def _focal_lengths(
         degrees = lens[f"{axis}_fov"]
         angles = [*([angle] if angle else []), *([math.radians(degrees)] if degrees else [])]
         by_angle = [side / 2 / math.tan(view / 2) for view in angles if 0 < view < math.pi]
-        if len(by_angle) < len(angles) or (length is not None and not length > 0):
-            raise wrong_camera(
-                where, f"a positive focal length fl_{axis}, or an angle below 180 degrees", str(length)
-            )
+        require_camera(
+            len(by_angle) == len(angles) and (length is None or length > 0),
+            where,
+            f"a positive focal length fl_{axis}, or an angle below 180 degrees",
+            str(length),
+        )
         stated = [*([float(length)] if length is not None else []), *([] if fisheye else by_angle)]
         if stated and max(stated) > (1 + _SAME_FOCAL) * min(stated):
             others = " and ".join(f"{one:.6g}" for one in stated)
@@ -345,15 +350,16 @@ def _focal_lengths(
             )
         lengths.append(stated[0] if stated else None)
     x, y = lengths
-    if x is None and y is None:
-        raise wrong_camera(where, "a focal length, fl_x or camera_angle_x", "none")
+    require_camera(x is not None or y is not None, where, "a focal length, fl_x or camera_angle_x", "none")
     return float(x or y or 0.0), float(y or x or 0.0)
 
 
 def brown_camera(inner: Sequence[float], coefficients: Sequence[float]) -> tuple[str, tuple[float, ...]]:
-    """COLMAP's model and parameters of a perspective camera with OpenCV's k1, k2, p1, p2 and k3.
+    """Return COLMAP's model and parameters of a perspective camera.
 
-    ``inner``: focal lengths and principal point.
+    Args:
+        inner: focal lengths and principal point.
+        coefficients: OpenCV's k1, k2, p1, p2 and k3.
     """
     if not any(coefficients):
         return "PINHOLE", tuple(inner)
@@ -363,12 +369,13 @@ def brown_camera(inner: Sequence[float], coefficients: Sequence[float]) -> tuple
 def camera_to_world(
     where: str, size: tuple[int, int], lens: tuple[str, tuple[float, ...]], to_world: Any
 ) -> PosedCamera:
-    """A camera from its pose in the world.
+    """Create a camera from its pose in the world.
 
     Args:
-        where: for messages. size: width and height.
-        lens: COLMAP's model and its parameters; pixel centers at 0.5.
-        to_world: [4, 4], with axes right, down, forward; a scale is taken out.
+        where: place for messages.
+        size: width and height.
+        lens: COLMAP's model and its parameters; pixel centers are at 0.5.
+        to_world: matrix with axes right, down, forward, [4, 4]; its scale is removed.
 
     Raises:
         PolarguideError: the matrix is not a pose.
@@ -381,18 +388,19 @@ def camera_to_world(
 
 
 SUFFIXES = (".json", ".xml", ".npz")
-
-
+"""Suffixes of pose files."""
 TEST = "test"
+"""Name of the test part of a dataset."""
 
 
 def parts_of_poses(folder: Path) -> dict[str, Path]:
-    """The pose files of a folder as NeRF's synthetic scenes have them: ``transforms_train.json`` and those of other
-    parts by part, or ``transforms.json`` as the only one.
+    """Find the pose files of a folder by part: ``transforms.json``, or ``transforms_train.json`` and its neighbors.
+
+    NeRF's synthetic scenes have a file for each of the parts train, val and test.
     """
-    whole = folder / "transforms.json"
-    if whole.is_file():
-        return {"all": whole}
+    single = folder / "transforms.json"
+    if single.is_file():
+        return {"all": single}
     parts = {part: folder / f"transforms_{part}.json" for part in ("train", "val", TEST)}
     return {part: path for part, path in parts.items() if path.is_file()}
 
@@ -400,39 +408,39 @@ def parts_of_poses(folder: Path) -> dict[str, Path]:
 def read_parts(
     parts: Mapping[str, Path], views: Sequence[str], sizes: Sizes
 ) -> tuple[dict[str, PosedCamera], tuple[str, ...]]:
-    """Cameras by view name from several files, and the views of the test part.
+    """Read cameras by view name from several files, and the views of the test part.
 
     Raises:
-        PolarguideError: as ``read_pose_file``, or two files have a camera of one view.
+        PolarguideError: ``read_pose_file`` rejects a file, or two files have a camera of one view.
     """
     cameras: dict[str, PosedCamera] = {}
     tests: tuple[str, ...] = ()
     for part, path in parts.items():
-        of_part = read_pose_file(path, views, sizes)
-        twice = sorted(cameras.keys() & of_part.keys())
+        part_cameras = read_pose_file(path, views, sizes)
+        duplicates = sorted(cameras.keys() & part_cameras.keys())
         require(
-            not twice,
+            not duplicates,
             path,
-            expected="frames that no other part has, as names of views are compared without folders",
-            found=f"{listed(twice)} again",
-            remedy="Give the pictures of each part names of their own, in the files of poses, too.",
+            expected="frames that no other part has (names of views are compared without folders)",
+            found=f"{listed(duplicates)} again",
+            remedy="Rename the pictures of each part, also in the pose files.",
         )
-        cameras |= of_part
-        tests = tuple(sorted(of_part)) if part == TEST else tests
+        cameras |= part_cameras
+        tests = tuple(sorted(part_cameras)) if part == TEST else tests
     return cameras, tests
 
 
 def read_pose_file(path: Path, views: Sequence[str], sizes: Sizes) -> dict[str, PosedCamera]:
-    """Cameras by view name.
+    """Read cameras by view name.
 
     Args:
         path: ``.json`` of nerfstudio, instant-ngp or Blender, ``.xml`` of Metashape, or ``.npz`` with ``world_mat_<i>``
             and ``scale_mat_<i>`` (IDR).
         views: names of the views, sorted.
-        sizes: what a view's camera may have been made for, where the file does not say.
+        sizes: possible sizes of a view's camera for files without a size.
 
     Raises:
-        PolarguideError: the file cannot be read, or describes no camera of these views.
+        PolarguideError: the file cannot be read, or has no camera of these views.
     """
     suffix = path.suffix.lower()
     if suffix == ".npz":
@@ -450,17 +458,17 @@ def read_pose_file(path: Path, views: Sequence[str], sizes: Sizes) -> dict[str, 
 
 
 def _idr(path: Path, views: Sequence[str], sizes: Sizes) -> dict[str, PosedCamera]:
-    """Cameras by number: of the views called so, or of the views in their order where there are as many.
+    """Read the cameras of IDR and match them with views by number, or by order if the counts are equal.
 
     Raises:
-        PolarguideError: the file does not say which camera is whose.
+        PolarguideError: the match is ambiguous.
     """
     cameras = read_projections(path).cameras
     numbered = {view: int(view) for view in views if view.isascii() and view.isdigit() and len(view) < 7}
     named = len(numbered) == len(views)
     order = sorted(views, key=lambda view: numbered[view]) if named else sorted(views)
     in_order = dict(zip(order, sorted(cameras), strict=False))
-    # As many of both: the order holds, whether numbers begin with 0 or 1.
+    # With equal counts the order decides, and numbers may begin with 0 or 1.
     offsets = {number - in_order[view] for view, number in numbered.items() if view in in_order}
     if len(cameras) == len(views) and len(offsets) <= 1:
         chosen = in_order
@@ -469,9 +477,9 @@ def _idr(path: Path, views: Sequence[str], sizes: Sizes) -> dict[str, PosedCamer
     else:
         raise PolarguideError(
             path,
-            expected=f"as many cameras as views, {len(views)}, or one of the number of every view",
+            expected=f"as many cameras as views, {len(views)}, or a camera with the number of each view",
             found=f"{len(cameras)} cameras, world_mat_{min(cameras)} to world_mat_{max(cameras)}",
-            remedy="Number the views as the cameras are: view 7 has world_mat_7. Or leave out cameras without a view.",
+            remedy="Number the views like the cameras (view 7 has world_mat_7), or remove cameras without a view.",
         )
     posed = {}
     for view, number in chosen.items():
@@ -484,18 +492,18 @@ def _idr(path: Path, views: Sequence[str], sizes: Sizes) -> dict[str, PosedCamer
 
 _LARGEST_XML = 1 << 24
 _METASHAPE_LENS = ("f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4")
-# Pixels by which skew may move those at the edge of the picture: less than what two ways to count pixels differ by.
 _LARGEST_SKEW = 0.25
-# Fisheyes are equidistant, under their name since version 2.3.
+"""Largest shift in pixels by skew at the edge of a picture. Conventions of pixel centers differ by more."""
 _EQUIDISTANT = ("fisheye", "equidistant_fisheye")
+"""Types of equidistant fisheye lenses before and since version 2.3."""
 _OFF = ("", "0", "false", "none", "disabled")
 _METASHAPE_FIELDS = {
     "sensor": {"resolution", "calibration", "rolling_shutter"},
     "calibration": {"resolution", *_METASHAPE_LENS},
     "camera": {"transform", "rolling_shutter"},
 }
-# Fields that change no camera: bands, exposures, accuracies, GPS, and the placement of the chunk in the world.
-# ``orientation`` is how Metashape displays a picture; pose and calibration are of the stored pixels.
+# Fields without influence on a camera: bands, exposures, accuracies, GPS, and the placement of the chunk in the world.
+# ``orientation`` is for display only; pose and calibration refer to the stored pixels.
 _METASHAPE_IRRELEVANT = {
     "sensor": {
         "property", "bands", "data_type", "covariance", "meta", "fixed", "fixed_params", "fixed_calibration",
@@ -512,29 +520,27 @@ _METASHAPE_IRRELEVANT = {
 
 
 def read_metashape(path: Path, views: Collection[str]) -> dict[str, PosedCamera]:
-    """Cameras by the views that their labels mean.
+    """Read Metashape's cameras by the views of their labels.
 
     Args:
-        path: the file.
+        path: path of the file.
         views: names of the capture's views.
 
     Raises:
-        PolarguideError: the file cannot be read, or its cameras are not all in one frame, or have another lens.
+        PolarguideError: the file cannot be read, its cameras have several coordinate frames, or a lens is unsupported.
     """
     chunk = _chunk(path, _parsed(path))
     cameras = list(chunk.iter("camera"))
     enabled = [camera for camera in cameras if camera.get("enabled", "true") not in _OFF]
-    # Cameras without a label are of no picture.
+    # Cameras without a label have no picture.
     posed = [camera for camera in enabled if camera.get("label") and camera.findtext("transform") is not None]
     _require_one_component(path, chunk, posed)
     if len(enabled) < len(cameras):
-        _warn(path, f"{len(cameras) - len(enabled)} cameras that are not enabled, which are left out")
+        _warn(path, f"{len(cameras) - len(enabled)} disabled cameras, which are ignored")
     slaves = [camera for camera in enabled if camera.get("master_id") and camera not in posed]
     if slaves:
         labels = listed([camera.get("label") or "" for camera in slaves])
-        _warn(
-            path, f"{len(slaves)} cameras of a rig without a pose of their own, which are left out ({labels})"
-        )
+        _warn(path, f"{len(slaves)} cameras of a rig without a pose, which are ignored ({labels})")
     sensors = {sensor.get("id"): sensor for sensor in chunk.iter("sensor")}
     world_cameras: dict[str, PosedCamera] = {}
     for camera in posed:
@@ -543,7 +549,7 @@ def read_metashape(path: Path, views: Collection[str]) -> dict[str, PosedCamera]
         view = view_of_name(label, views)
         sensor = sensors.get(camera.get("sensor_id"))
         if sensor is None:
-            raise wrong_camera(where, "the sensor it names", "none")
+            raise wrong_camera(where, "the sensor of its sensor_id", "none")
         require_camera(view not in world_cameras, where, f"one camera called {view}", "two")
         _require_known(path, camera, sensor)
         text = camera.findtext("transform") or ""
@@ -554,14 +560,15 @@ def read_metashape(path: Path, views: Collection[str]) -> dict[str, PosedCamera]
 
 
 def _warn(path: Path, text: str) -> None:
+    """Warn about a feature of a pose file."""
     warnings.warn(f"{path.name} has {text}.", PolarguideWarning, stacklevel=3)
 
 
 def _chunk(path: Path, root: ElementTree.Element) -> ElementTree.Element:
-    """The chunk whose cameras have poses; each has a frame of its own.
+    """Return the only chunk whose cameras have poses. Each chunk has a coordinate frame of its own.
 
     Raises:
-        PolarguideError: several have.
+        PolarguideError: several chunks have poses.
     """
     chunks = [
         chunk
@@ -574,7 +581,7 @@ def _chunk(path: Path, root: ElementTree.Element) -> ElementTree.Element:
             path,
             expected="cameras of one chunk, which are in one frame",
             found=f"{len(chunks)} chunks ({labels})",
-            remedy="Export the chunk of these pictures alone, or align and merge the chunks first.",
+            remedy="Export only the chunk of these pictures, or align and merge the chunks first.",
         )
     return chunks[0] if chunks else root
 
@@ -582,15 +589,12 @@ def _chunk(path: Path, root: ElementTree.Element) -> ElementTree.Element:
 def _require_one_component(
     path: Path, chunk: ElementTree.Element, posed: Sequence[ElementTree.Element]
 ) -> None:
-    """Refuse cameras that were aligned apart: how their components lie to one another is not known.
+    """Refuse cameras of several components, whose relative poses are unknown.
 
     Raises:
-        PolarguideError: there are.
+        PolarguideError: the cameras have several components.
     """
-    counts: dict[str, int] = {}
-    for camera in posed:
-        number = camera.get("component_id") or "none"
-        counts[number] = counts.get(number, 0) + 1
+    counts = Counter(camera.get("component_id") or "none" for camera in posed)
     if len(counts) > 1:
         labels = {component.get("id"): component.get("label") for component in chunk.iter("component")}
         raise PolarguideError(
@@ -599,15 +603,15 @@ def _require_one_component(
             found=listed(
                 [f"{labels.get(number) or number} with {count}" for number, count in counts.items()]
             ),
-            remedy="Align the components with one another in Metashape, or reset those that are not wanted.",
+            remedy="Align the components with one another in Metashape, or reset the others.",
         )
 
 
 def _require_known(path: Path, camera: ElementTree.Element, sensor: ElementTree.Element) -> None:
-    """Refuse a rolling shutter, and warn of elements that are not known.
+    """Refuse a rolling shutter, and warn about unknown elements.
 
     Raises:
-        PolarguideError: the shutter is one.
+        PolarguideError: the camera has a rolling shutter.
     """
     for element in (camera, sensor):
         for shutter in element.iter("rolling_shutter"):
@@ -627,22 +631,25 @@ def _require_known(path: Path, camera: ElementTree.Element, sensor: ElementTree.
 
 
 def _metashape_lens(where: str, sensor: Any) -> tuple[tuple[int, int], tuple[str, tuple[float, ...]]]:
-    """Size of a sensor, and COLMAP's model of its lens with parameters; the adjusted calibration goes first.
+    """Return a sensor's size, and COLMAP's model and parameters of its lens. An adjusted calibration takes precedence.
 
-    Metashape's p1 bends along x, and so does p2 of OpenCV and COLMAP. Its fisheye distorts the angle from the axis by
-    the same terms as a frame camera its tangent.
+    Metashape's p1 and p2 are OpenCV's and COLMAP's p2 and p1. Its fisheye applies the same polynomial to the angle from
+    the axis that a frame camera applies to the tangent.
 
     Raises:
-        PolarguideError: the lens is a panorama or another that is not read, or has terms that COLMAP's has not.
+        PolarguideError: the type of the lens is unsupported, or COLMAP's model lacks one of its terms.
     """
     calibrations = sensor.findall("calibration")
     adjusted = [c for c in calibrations if c.get("class") == "adjusted"]
     best = next(iter(adjusted or calibrations), None)
     kinds = {sensor.get("type", "frame"), *([] if best is None else [best.get("type", "frame")])}
     fisheye = kinds <= set(_EQUIDISTANT)
-    if kinds != {"frame"} and not fisheye:
-        found = f"a {' and '.join(sorted(kinds - {'frame'}))} camera"
-        raise wrong_camera(where, f"a camera of the type frame, {' or '.join(_EQUIDISTANT)}", found)
+    require_camera(
+        kinds == {"frame"} or fisheye,
+        where,
+        f"a camera of the type frame, {' or '.join(_EQUIDISTANT)}",
+        f"a {' and '.join(sorted(kinds - {'frame'}))} camera",
+    )
     resolution = None if best is None else best.find("resolution")
     resolution = sensor.find("resolution") if resolution is None else resolution
     if best is None or resolution is None or best.findtext("f") is None:
@@ -652,40 +659,44 @@ def _metashape_lens(where: str, sensor: Any) -> tuple[tuple[int, int], tuple[str
     )
     value = {name: float(number) for name, number in zip(_METASHAPE_LENS, numbers, strict=True)}
     width, height = (number_or_nan(resolution.get(side, "0")) for side in ("width", "height"))
-    if not (1 <= width < 1e5 and 1 <= height < 1e5 and value["f"] > 0):
-        found = f"{width:g}x{height:g}, f = {value['f']:g}"
-        raise wrong_camera(where, "a size and a positive focal length", found)
+    require_camera(
+        1 <= width < 1e5 and 1 <= height < 1e5 and value["f"] > 0,
+        where,
+        "a size and a positive focal length",
+        f"{width:g}x{height:g}, f = {value['f']:g}",
+    )
     _require_terms(where, value, height, ("p3", "p4") if fisheye else ("k4", "p3", "p4"))
     inner = (value["f"] + value["b1"], value["f"], width / 2 + value["cx"], height / 2 + value["cy"])
-    names = ("k1", "k2", "p2", "p1", "k3")
-    terms = [value[name] for name in names]
+    size = (int(width), int(height))
+    terms = [value[name] for name in ("k1", "k2", "p2", "p1", "k3")]
     if fisheye:
-        return (int(width), int(height)), ("THIN_PRISM_FISHEYE", (*inner, *terms, value["k4"], 0.0, 0.0))
-    return (int(width), int(height)), brown_camera(inner, terms)
+        return size, ("THIN_PRISM_FISHEYE", (*inner, *terms, value["k4"], 0.0, 0.0))
+    return size, brown_camera(inner, terms)
 
 
 def _require_terms(where: str, value: Mapping[str, float], height: float, others: Sequence[str]) -> None:
-    """Refuse a lens with terms that its model does not have: ``others``, and a skew that moves pixels.
+    """Refuse a lens with terms that its model lacks: ``others``, and a skew that moves pixels.
 
     Raises:
         PolarguideError: the lens has such a term.
     """
     skew = abs(value["b2"]) * height / 2 / value["f"]
-    named = [name for name in others if value[name]] + ["b2"] * (skew > _LARGEST_SKEW)
-    if named:
+    present = [name for name in others if value[name]] + ["b2"] * (skew > _LARGEST_SKEW)
+    if present:
         terms = [name for name in _METASHAPE_LENS if name not in (*others, "b2")]
         raise PolarguideError(
             where,
             expected=f"a lens with {listed(terms, len(terms))}",
-            found=", ".join(f"{name} = {value[name]:g}" for name in named),
+            found=", ".join(f"{name} = {value[name]:g}" for name in present),
             remedy="Optimize the cameras in Metashape without these terms, and export them again.",
         )
 
 
 def _parsed(path: Path) -> ElementTree.Element:
+    """Parse Metashape's XML. Entities are refused."""
     data = read_file(path, largest=_LARGEST_XML)
     found = "something else"
-    # In UTF-16, entities would hide from this search.
+    # Encodings with zero bytes, such as UTF-16, could hide entities.
     if b"\0" not in data and b"<!ENTITY" not in data and b"<!DOCTYPE" not in data:
         try:
             return ElementTree.fromstring(data)

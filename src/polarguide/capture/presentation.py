@@ -1,9 +1,9 @@
-"""How a capture is presented: color, up, scale and crop box, and whom it is owed to.
+"""Presentation of a capture: color, up axis, scale, crop box and credits.
 
-``presentation.json`` beside a scene or a run holds it. Whatever shows or exports a run uses it; pictures, training and
-scores never do. A run's own file goes before that of its scene, field by field.
+``presentation.json`` next to a scene or a run stores them for display and export. Pictures, training and scores do not
+use them. Fields of a run take precedence over those of its scene.
 
-The names are those of USD (``metersPerUnit``, ``upAxis``) and of what glTF files say of their asset.
+Names follow USD (``metersPerUnit``, ``upAxis``) and the asset metadata of glTF.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ PRESENTATION_FILE = "presentation.json"
 REMEDY = "Correct it with polarguide present, or remove the file."
 CREDITS = ("title", "author", "license", "provenance")
 LENGTHS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "km": 1e3, "in": 0.0254, "ft": 0.3048}
-"""Meters of each unit of length that is understood."""
+"""Meters per unit of length."""
 LEAST_METERS = 1e-9
-"""A nanometer."""
+"""Smallest length of a unit: a nanometer. Exported files have single precision, which limits both ends."""
 MOST_METERS = 1e9
-"""Eighty Earths. Single precision of exported files ends beyond both limits."""
+"""Largest length of a unit: eighty Earths."""
 WIDEST_CROP = 100.0
 STOPS = 8.0
-"""Of exposure, to either side: as much as the steps of an 8-bit picture."""
+"""Largest exposure in stops in both directions: the number of bits of a displayed picture."""
 
 Vector = tuple[float, float, float]
 Gain = Annotated[float, Meta(ge=0.02, le=50)]
@@ -46,12 +46,12 @@ Text = Annotated[str, Meta(max_length=1000)]
 
 
 class Crop(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
-    """A box about the point that the cameras look at, along their common right, up and back.
+    """Box around the point that the cameras look at, along their common right, up and back.
 
     Attributes:
-        low, high: corners in shares of the cameras' distance from that point; low is less than high.
-        up: [3] what was up when it was made, in the scene's axes; None: as the cameras say. The box keeps its place
-            when another axis is chosen.
+        low, high: corners relative to the cameras' distance from that point; low is less than high.
+        up: up axis when the box was made, in the scene's axes [3]; default: that of the cameras. The box does not move
+            when another up axis is chosen.
     """
 
     low: Vector
@@ -63,24 +63,25 @@ class Crop(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_default
             require(
                 -WIDEST_CROP <= low < high <= WIDEST_CROP,
                 "crop",
-                expected=f"a low side less than the high one, both within {WIDEST_CROP:g} distances",
+                expected=f"a low side less than the high side, both within {WIDEST_CROP:g} distances",
                 found=f"{low:g} to {high:g}",
                 remedy=REMEDY,
             )
         _check_direction("crop.up", self.up)
 
     def _frame(self, around: SceneFrame) -> SceneFrame:
+        """Return the frame of the box."""
         return around if self.up is None else _upright(around, self.up)
 
     def corners(self, around: SceneFrame) -> Tensor:
-        """Its eight corners in the world, [8, 3] float64, the last axis fastest, from the cameras' own frame."""
+        """Return the eight corners in the world, [8, 3] float64, last axis fastest, from the frame of the cameras."""
         frame = self._frame(around)
         sides = torch.tensor([self.low, self.high], dtype=torch.float64)
         local = torch.cartesian_prod(*sides.T) * frame.distance
         return frame.center + local @ frame.panorama_axes().T
 
     def inside(self, means: Tensor, around: SceneFrame) -> Tensor:
-        """Which means [N, 3] lie in it, [N] bool; ``around`` is the cameras' own frame."""
+        """Return a mask [N] of the points [N, 3] in the box; ``around`` is the frame of the cameras."""
         frame = self._frame(around)
         axes, center = (t.to(means) for t in (frame.panorama_axes(), frame.center))
         local = (means - center) @ axes / frame.distance
@@ -91,12 +92,13 @@ class Crop(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_default
 
 
 class Chart(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What a color chart in a photograph says of the camera under the light of the capture.
+    """Color correction by a color chart in a photograph, for the light of the capture.
 
     Attributes:
-        matrix: [3][3], from the camera's linear RGB (S0 / 2) to linear sRGB (D65), white balance and exposure included.
-        delta_e, delta_e_worst: mean and largest CIEDE2000 of the patches, each by the matrix that the others give.
-        patches: how many were used. view: the photograph.
+        matrix: from the camera's linear RGB (S0 / 2) to linear sRGB (D65), with white balance and exposure, [3][3].
+        delta_e, delta_e_worst: mean and largest CIEDE2000 of the patches in leave-one-out validation.
+        patches: number of patches.
+        view: name of the photograph.
     """
 
     matrix: tuple[tuple[Factor, Factor, Factor], tuple[Factor, Factor, Factor], tuple[Factor, Factor, Factor]]
@@ -117,25 +119,27 @@ class Chart(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         require(
             darkest > 0,
             "matrix",
-            expected="rows with positive sums: what is gray to the camera has light in every channel",
-            found=f"a sum of {darkest:g}, which makes it black",
+            expected="rows with positive sums, which give gray light in every channel",
+            found=f"a sum of {darkest:g}, which makes gray black",
             remedy=REMEDY,
         )
 
 
 class Presentation(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
-    """What ``presentation.json`` holds; each field may be missing.
+    """Content of ``presentation.json``. All fields are optional.
 
     Attributes:
-        white_balance: factors on linear R, G and B for display, 0.02 to 50; the data stay as they are.
-        chart: what a color chart says, in place of a white balance; there cannot be both.
-        exposure: stops by which radiance is shown brighter, -8 to 8.
-        up_axis: [3] direction in the scene's axes, of any length; without it, up is as the cameras say.
-        meters_per_unit: how long one unit of the scene is.
-        crop: what is shown and exported of the scene. whole: all of it is, in place of a crop box; there cannot be
-            both.
-        title: what is shown. author: whom the capture is owed to. license: a name, such as CC-BY-4.0.
-        provenance: where, when and with what it was captured, or a number of an inventory.
+        white_balance: factors on linear R, G and B for display, 0.02 to 50; data do not change.
+        chart: color chart, as alternative to a white balance.
+        exposure: stops by which the display is brighter, -8 to 8.
+        up_axis: up direction in the scene's axes, of any length, [3]; default: that of the cameras.
+        meters_per_unit: length of a unit of the scene.
+        crop: box of the displayed and exported part of the scene.
+        whole: if True, the whole scene is displayed, as alternative to a crop box.
+        title: title of the capture.
+        author: author of the capture.
+        license: name of a license, such as CC-BY-4.0.
+        provenance: place, time and method of the capture, or a number of an inventory.
     """
 
     white_balance: tuple[Gain, Gain, Gain] | None = None
@@ -152,12 +156,14 @@ class Presentation(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit
 
     def __post_init__(self) -> None:
         _check_direction("up_axis", self.up_axis)
-        if self.white_balance is not None and self.chart is not None:
-            found = "both"
-            raise PolarguideError("white_balance", expected="it, or a chart", found=found, remedy=REMEDY)
-        if self.crop is not None and self.whole:
-            found = "both"
-            raise PolarguideError("crop", expected="a box, or the whole scene", found=found, remedy=REMEDY)
+        for first, second in EITHER:
+            require(
+                getattr(self, first) is None or not getattr(self, second),
+                first,
+                expected=f"{first} or {second}",
+                found="both",
+                remedy=REMEDY,
+            )
         for name in CREDITS:
             text = getattr(self, name)
             require(
@@ -166,15 +172,15 @@ class Presentation(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit
 
     @property
     def credit(self) -> str:
-        """Author and license in one line; empty where there are none."""
+        """Author and license in one line; may be empty."""
         return ", ".join(text for text in (self.author, self.license) if text)
 
     @property
     def color(self) -> Tensor | None:
-        """From the camera's linear RGB to what is shown, linear sRGB: [3, 3] float32; None: as photographed.
+        """Matrix from the camera's linear RGB to displayed linear sRGB, [3, 3] float32; None: as photographed.
 
-        It holds for radiance: each row mixes the camera's channels, as light adds up. Stokes vectors, DoLP and AoLP are
-        ratios within one channel, and stay the camera's.
+        The matrix applies to radiance, because light adds up. Stokes vectors, DoLP and AoLP are ratios within a channel
+        of the camera and do not change.
         """
         if self.white_balance is None and self.chart is None and not self.exposure:
             return None
@@ -184,39 +190,42 @@ class Presentation(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit
         return matrix * 2.0 ** (self.exposure or 0.0)
 
     def over(self, other: Presentation) -> Presentation:
-        """This, with another's fields where this one has none; those of ``EITHER`` are one of them."""
-        own = _given(self)
-        above = _given(other)
+        """Return the fields of this presentation, with those of another as default; see ``EITHER``."""
+        own = _specified_fields(self)
+        default = _specified_fields(other)
         for names in EITHER:
             if not own.keys().isdisjoint(names):
-                above = {name: value for name, value in above.items() if name not in names}
-        return Presentation(**{**above, **own})
+                default = {name: value for name, value in default.items() if name not in names}
+        return Presentation(**{**default, **own})
 
     def upright(self, around: SceneFrame) -> SceneFrame:
-        """A frame of cameras with the up axis that was chosen, if one was."""
+        """Return a frame of cameras with the specified up axis."""
         return around if self.up_axis is None else _upright(around, self.up_axis)
 
     def to_record(self) -> dict[str, Any]:
-        """As the file holds it, without what is missing."""
+        """Return the content of the file without missing fields."""
         record: dict[str, Any] = msgspec.to_builtins(self)
         return record
 
 
 EITHER = (("white_balance", "chart"), ("crop", "whole"))
-"""Fields of which one takes the place of the other."""
+"""Pairs of fields of which only one may be specified."""
 
 
-def _given(presentation: Presentation) -> Mapping[str, Any]:
+def _specified_fields(presentation: Presentation) -> Mapping[str, Any]:
+    """Return the fields with a value."""
     fields = {name: getattr(presentation, name) for name in presentation.__struct_fields__}
     return {name: value for name, value in fields.items() if value not in (None, "", False)}
 
 
 def _upright(around: SceneFrame, up: Vector) -> SceneFrame:
+    """Return a frame with another up axis."""
     axis = torch.tensor(up, dtype=torch.float64)
     return replace(around, up=axis / axis.norm())
 
 
 def _check_direction(name: str, vector: Vector | None) -> None:
+    """Refuse a vector without a direction."""
     if vector is not None and not (all(map(math.isfinite, vector)) and 1e-9 < math.hypot(*vector) < 1e9):
         raise PolarguideError(
             name, expected="a direction, three numbers not all 0", found=str(list(vector)), remedy=REMEDY
@@ -224,17 +233,17 @@ def _check_direction(name: str, vector: Vector | None) -> None:
 
 
 def read_presentation(folder: Path) -> Presentation:
-    """What a scene's or a run's folder says; nothing where it has no such file.
+    """Read the presentation of a scene or a run; an empty one if there is no file.
 
     Raises:
-        PolarguideError: the file is not such a record.
+        PolarguideError: the file is invalid.
     """
     path = folder / PRESENTATION_FILE
     return read_record(path, Presentation, remedy=REMEDY) if os.path.lexists(path) else Presentation()
 
 
 def write_presentation(folder: Path, presentation: Presentation) -> Path:
-    """Write the file of a scene or a run as a whole.
+    """Write the presentation of a scene or a run.
 
     Raises:
         PolarguideError: the file cannot be written.
@@ -245,7 +254,7 @@ def write_presentation(folder: Path, presentation: Presentation) -> Path:
 
 
 def parse_length(text: str) -> float:
-    """Meters of a length such as ``85mm``, ``8.5 cm``, ``0.085``.
+    """Parse a length such as ``85mm``, ``8.5 cm``, ``0.085`` and return it in meters.
 
     Raises:
         PolarguideError: the text is not a length.
@@ -258,13 +267,13 @@ def parse_length(text: str) -> float:
         "distance",
         expected=f"a length above 0 such as 85mm (units: {', '.join(LENGTHS)}; m without one)",
         found=repr(text),
-        remedy="Give a number above 0 and its unit.",
+        remedy="Enter a number above 0 and its unit.",
     )
     return meters
 
 
 def shown_length(units: float, meters_per_unit: float | None) -> str:
-    """A length of the scene in words: ``85.0 mm``, or ``0.532 units`` without a scale."""
+    """Format a length of the scene, such as ``85.0 mm``, or ``0.532 units`` without a scale."""
     if meters_per_unit is None:
         return f"{units:.4g} units"
     meters = units * meters_per_unit
@@ -275,18 +284,19 @@ def shown_length(units: float, meters_per_unit: float | None) -> str:
 
 
 def colored(radiance: Tensor, color: Tensor | None) -> Tensor:
-    """Linear radiance [..., 3] as it is shown, by ``Presentation.color``, not negative."""
+    """Convert linear radiance [..., 3] to displayed colors by ``Presentation.color``, clamped at 0."""
     return radiance if color is None else (radiance @ color.T.to(radiance)).clamp(min=0)
 
 
 def in_camera(radiance: Tensor, color: Tensor | None) -> Tensor:
-    """The inverse of ``colored``: radiance of linear sRGB as the camera's channels would have it."""
+    """Convert displayed linear sRGB to radiance of the camera's channels: the inverse of ``colored``."""
     return radiance if color is None else colored(radiance, torch.linalg.inv(color))
 
 
 def colored_reflectance(reflectance: Tensor, color: Tensor | None) -> Tensor:
-    """Reflectance [..., 3] of the camera's channels as that of linear sRGB: what it makes of the light that is white
-    there, ``M (r * M^-1 1)``. A white balance and an exposure leave it as it is.
+    """Convert reflectance [..., 3] of the camera's channels to linear sRGB: ``M (r * M^-1 1)``.
+
+    It is the color of the surface in light that is displayed as white. White balance and exposure do not change it.
     """
     if color is None:
         return reflectance

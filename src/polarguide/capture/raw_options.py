@@ -1,6 +1,6 @@
-"""Options of camera files, one type for each kind of file. No import of torch or OpenCV.
+"""Options of camera files, one type for each kind of file. This module does not import torch or OpenCV.
 
-The options of a command are one flat class, which inherits the types of all kinds that the command reads.
+The options of a command are one flat class that inherits the types of all kinds that the command reads.
 """
 
 from __future__ import annotations
@@ -58,8 +58,8 @@ class GainOptions(CameraOptions):
     """Options of pictures whose gains are estimated.
 
     Attributes:
-        gains: auto corrects the exposures that files state (EXIF), and the gains that the light implies; exif only the
-            former; none leaves both.
+        gains: auto divides by the exposures that files state (EXIF) and by the gains that the light implies; exif
+            divides by the former only; none by neither.
     """
 
     gains: Literal["auto", "exif", "none"] = "auto"
@@ -86,13 +86,13 @@ class RawMosaicOptions(MosaicOptions, SampledOptions, GainOptions):
     """Options of raw mosaics.
 
     Attributes:
-        dark_frame: Picture with the lens covered, subtracted in place of the black level.
-        gamma: Gamma that the camera applied to mosaics: stored = light ^ gamma.
-        flip: Which way the mosaics were mirrored (Reverse X, Reverse Y), or the degrees by which they were turned
-            counter-clockwise: undone before anything else.
-        demosaic: Resolution, in parts of the sensor's.
-        interpolation: How half and full fill in colors and angles.
-        analyzers: calibration of the sensor that polarguide calibrate wrote; takes the place of gains.
+        dark_frame: Picture with the lens covered. It is subtracted instead of the black level.
+        gamma: Gamma that the camera applied to mosaics, stored = light ^ gamma.
+        flip: Mirroring (Reverse X, Reverse Y) or counter-clockwise rotation of the mosaics in degrees. It is undone
+            first.
+        demosaic: Resolution as a fraction of the sensor's.
+        interpolation: Interpolation of missing colors and angles in the modes half and full.
+        analyzers: calibration of the sensor from polarguide calibrate, which replaces gains.
     """
 
     dark_frame: Path | None = None
@@ -125,7 +125,7 @@ def changed(options: Any) -> list[str]:
 
 
 def misplaced(options: RawOptions, kind: type, kinds: Mapping[str, type]) -> list[tuple[str, list[str]]]:
-    """Return the changed options that have no effect on a kind of source, each with the kinds that have it.
+    """Return the changed options without effect on a kind of source, each with the kinds that have it.
 
     Args:
         options: options of a command. kind: type of the options of the source.
@@ -137,4 +137,4 @@ def misplaced(options: RawOptions, kind: type, kinds: Mapping[str, type]) -> lis
         for option in changed(options)
         if option not in names
     }
-    return [(option, found) for option, found in owners.items() if found]
+    return [(option, kinds_of_option) for option, kinds_of_option in owners.items() if kinds_of_option]

@@ -1,4 +1,4 @@
-"""The scene: posed views, those held out to be scored on, sparse points and their origin; of a folder, or of arrays."""
+"""Scenes: posed views, their split, sparse points and their origin, from a folder or from arrays."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from polarguide.capture import checks
 from polarguide.capture.colmap.model import ColmapModel, fit_camera, read_model, unseen_points, unused_poses
 from polarguide.capture.exposures import FOUR, Angle
 from polarguide.capture.formats.pictures import TRANSFERS
-from polarguide.capture.layout import Layout, check_memory, find_layout, select_views, stated_size
+from polarguide.capture.layout import CaptureFiles, check_memory, find_layout, select_views, stated_size
 from polarguide.capture.metadata import (
     GroundTruth,
     SceneObject,
@@ -57,24 +57,24 @@ from polarguide.geometry.camera import Camera
 from polarguide.optics import Mount
 
 TEST_EVERY = 8
-"""One view in so many is held out."""
+"""Number of views per held-out view."""
 FAR = 2.5
-"""A held-out view is far from training if its nearest training view is this many times as far as views usually are from
-each other."""
+"""Distance of a held-out view from its nearest training view, relative to the usual distance, above which it is far."""
 FEWEST_IN_BAND = 4
-"""Views from which on a band of heights counts as one."""
+"""Smallest number of views in a band of heights."""
 SAME_HEIGHT = 1e-3
-"""Heights that differ by less than this share of how far they spread are those of one ring."""
+"""Difference of heights in one ring, as a share of the range of all heights."""
 _ROUNDS = 10
 
 
 def chosen_views(cameras: Mapping[str, Camera], split: Split) -> tuple[str, ...]:
-    """The names of the views to hold out, one in ``TEST_EVERY``, sorted; none of a single view.
+    """Choose the names of the held-out views, one in ``TEST_EVERY``, sorted. A single view is not held out.
 
     Args:
-        cameras: of the views, by name. split: "every-8th" takes every 8th in the order of the names, starting with the
-            first. "directions" takes the middle one of each of as many groups of neighboring views, so that every
-            held-out view has training views around it, and no part of the directions is held out as a whole.
+        cameras: cameras of the views by name.
+        split: "every-8th" for every 8th view in the order of the names from the first. "directions" for the medoids of
+            groups of neighboring views: every held-out view has training views around it, and no range of directions
+            is held out as a whole.
     """
     names = sorted(cameras)
     if len(names) < 2:
@@ -86,22 +86,22 @@ def chosen_views(cameras: Mapping[str, Camera], split: Split) -> tuple[str, ...]
 
 
 def far_from_training(cameras: Mapping[str, Camera], tests: Sequence[str]) -> list[str]:
-    """The held-out views that are far from all training views, see ``FAR``, sorted."""
+    """Return the held-out views that are far from all training views, see ``FAR``, sorted."""
     names = sorted(cameras)
     trains = [k for k, name in enumerate(names) if name not in tests]
     if len(names) < 3 or not trains:
         return []
     apart = _distances([cameras[name] for name in names])
     others = apart + np.diag(np.full(len(names), np.inf))
-    usual = float(np.median(others.min(axis=1)))
-    return [name for k, name in enumerate(names) if name in tests and apart[k, trains].min() > FAR * usual]
+    typical = float(np.median(others.min(axis=1)))
+    return [name for k, name in enumerate(names) if name in tests and apart[k, trains].min() > FAR * typical]
 
 
 def held_out_band(cameras: Mapping[str, Camera], tests: Sequence[str]) -> list[str]:
-    """The held-out views of a band of heights in which no view is trained on, such as a whole ring; empty if none.
+    """Return the held-out views of a band of heights without training views, such as a whole ring.
 
-    Told are bands of at least ``FEWEST_IN_BAND`` views and half of those that are held out. Heights are along the mean
-    of what is up in the pictures.
+    The band must have ``FEWEST_IN_BAND`` views and half of the held-out views; otherwise the list is empty. Heights are
+    along the mean up direction of the pictures.
     """
     names = sorted(cameras)
     if not names:
@@ -127,7 +127,7 @@ def held_out_band(cameras: Mapping[str, Camera], tests: Sequence[str]) -> list[s
 
 
 def _distances(cameras: Sequence[Camera]) -> NDArray[np.float64]:
-    """[V, V] distances: of the centers, in units of how far they spread, and of the viewing directions."""
+    """Return the distances [V, V] of cameras by center, relative to the spread of centers, and by viewing direction."""
     centers = np.stack([camera.center.double().numpy() for camera in cameras])
     looks = np.stack([camera.rotation[2].double().numpy() for camera in cameras])
     spread = np.linalg.norm(centers - np.median(centers, axis=0), axis=1).max()
@@ -136,15 +136,15 @@ def _distances(cameras: Sequence[Camera]) -> NDArray[np.float64]:
 
 
 def _middles(apart: NDArray[np.float64], count: int) -> list[int]:
-    """The views in the middle of ``count`` groups: k-medoids from the views that are farthest from each other.
+    """Choose the medoids of ``count`` groups of views by k-medoids, initialized with the farthest views.
 
-    Groups of one or two views have no middle: in their place views are taken of the largest groups, far from those that
-    are taken already.
+    Groups of one or two views have no middle. They are replaced by views of the largest groups, far from those already
+    chosen.
     """
     middles = [int(apart.sum(axis=1).argmin())]
     while len(middles) < count:
         reach = apart[:, middles].min(axis=1)
-        reach[middles] = -1.0  # never twice, also of cameras in one place
+        reach[middles] = -1.0  # never twice, also for cameras in one place
         middles.append(int(reach.argmax()))
     for _ in range(_ROUNDS):
         group = apart[:, middles].argmin(axis=1)
@@ -157,7 +157,7 @@ def _middles(apart: NDArray[np.float64], count: int) -> list[int]:
     taken = [middle for middle, m in zip(middles, members, strict=True) if len(m) > 2]
     while len(taken) < count:
         free = [int(k) for m in members if len(m) > 2 for k in m if k not in taken]
-        if not free:  # every group is that small
+        if not free:  # all groups are small
             return middles
         reach = apart[np.ix_(free, taken)].min(axis=1)
         taken.append(free[int(reach.argmax())])
@@ -165,29 +165,29 @@ def _middles(apart: NDArray[np.float64], count: int) -> list[int]:
 
 
 IN_MEMORY = Path("(arrays)")
-"""The folder of a scene that was made of arrays: there is no such folder."""
+"""Placeholder for the folder of a scene that was made of arrays."""
 _PICTURED = 6
-"""Views that a notebook shows of a scene."""
+"""Number of views in a notebook's preview of a scene."""
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A capture: posed views, sparse points and their origin.
+    """Capture with posed views, sparse points and their origin.
 
     Attributes:
-        root: the folder that was read; ``IN_MEMORY`` of ``from_arrays``.
-        name: its name.
+        root: folder of the capture; ``IN_MEMORY`` for ``from_arrays``.
+        name: name of the scene.
         views: all views, sorted by name.
-        test_names: names of the views held out for evaluation, sorted.
+        test_names: names of the held-out views, sorted.
         points: sparse points in the world, [M, 3] float32.
-        point_colors: their colors as the COLMAP model gives them (display-encoded), [M, 3] uint8.
-        refractive_index: the one index that ``scene.json`` gives, or None if it gives none or several.
-        downscale: side of the pixel boxes that were averaged; 1 is full size.
-        transfer: the assumed encoding of the files, "linear" or "srgb". The views are always linear.
-        digest: SHA-256 over the names and contents of all files that were read, as hexadecimal digits.
-        warnings: about possible faults that do not prevent the use of the scene.
-        objects: the objects that ``scene.json`` lists, if the ground truth of some view tells objects apart.
-        indices: refractive indices of the dielectrics that ``materials/`` names by numbers from 3 on.
+        point_colors: their display-encoded colors, [M, 3] uint8.
+        refractive_index: the refractive index in ``scene.json``; None if it has none or several.
+        downscale: side of the averaged pixel boxes; 1 is full size.
+        transfer: assumed encoding of the files, "linear" or "srgb". The views are always linear.
+        digest: SHA-256 of the names and contents of all files, as hexadecimal digits.
+        warnings: possible faults that do not prevent the use of the scene.
+        objects: objects of ``scene.json``, if some ground truth distinguishes objects.
+        indices: refractive indices of dielectrics by their number in ``materials/``, from 3 on.
     """
 
     root: Path
@@ -206,19 +206,19 @@ class Scene:
 
     @property
     def train_views(self) -> tuple[View, ...]:
-        """The training views, sorted by name."""
+        """Training views, sorted by name."""
         return tuple(view for view in self.views if view.name not in self.test_names)
 
     @property
     def test_views(self) -> tuple[View, ...]:
-        """The views held out for evaluation, sorted by name."""
+        """Held-out views, sorted by name."""
         return tuple(view for view in self.views if view.name in self.test_names)
 
     def view(self, name: str) -> View:
-        """The view called ``name``.
+        """Return the view with a name.
 
         Raises:
-            PolarguideError: there is none; the message lists the names nearest to it.
+            PolarguideError: there is no such view; the message lists similar names.
         """
         for view in self.views:
             if canonical(view.name) == canonical(name):
@@ -243,28 +243,31 @@ class Scene:
         refractive_index: float | None = None,
         name: str = "arrays",
     ) -> Scene:
-        """A scene of arrays, in memory: it is trained to the same bits as the same pictures in a folder.
+        """Create a scene in memory. Training gives the same bits as with the same pictures in a folder.
 
         Args:
-            pictures: of each view, [K, H, W, 3] RGB or [K, H, W] gray: uint8 or uint16 as a camera stores them, or
-                linear floats from 0 to 1, where 1 is full scale. By name, or in an order (then called v000, v001,
-                ...); views may differ in size.
-            cameras: cameras of each view, at the size of its pictures; ``Camera.from_matrices`` makes one of matrices.
-            angles: of the K pictures: degrees counter-clockwise as displayed, ``unknown`` or ``none`` (no filter); of
-                all views, or by name.
-            points: [M, 3] sparse points of the surfaces in the world, such as those of structure from motion.
-            point_colors: [M, 3] uint8, as displayed; None: gray.
-            masks: masks of the foreground, [H, W] bool a view. invalid: pixels without use, [H, W] bool a view.
-            test_views: names of the views to score on; None: as ``split`` chooses them.
-            split, transfer, downscale: as ``load_scene`` takes them. mount: where the polarizer was.
-            refractive_index: refractive index of the surfaces, None if it is not known. name: name of the scene.
+            pictures: pictures of each view, [K, H, W, 3] RGB or [K, H, W] gray: uint8 or uint16 as stored by a camera,
+                or linear floats from 0 to 1 at full scale. By name, or as a sequence (with the names v000, v001, ...);
+                views may differ in size.
+            cameras: cameras of each view at the size of its pictures; see ``Camera.from_matrices``.
+            angles: angles of the K pictures in degrees counter-clockwise as displayed, ``unknown`` or ``none`` (no
+                filter); for all views, or by name.
+            points: sparse points of the surfaces in the world, such as those of structure from motion, [M, 3].
+            point_colors: display-encoded colors of the points, [M, 3] uint8; default: gray.
+            masks: foreground masks of the views, [H, W] bool each.
+            invalid: masks of unusable pixels of the views, [H, W] bool each.
+            test_views: names of the held-out views; default: chosen by ``split``.
+            split, transfer, downscale: arguments of ``load_scene``.
+            mount: place of the polarizer.
+            refractive_index: refractive index of the surfaces, if known.
+            name: name of the scene.
 
         Example:
             >>> scene = polarguide.Scene.from_arrays(stack, cameras, points=points)    # doctest: +SKIP
             >>> polarguide.train(scene, "runs/mine")                                    # doctest: +SKIP
 
         Raises:
-            PolarguideError: an array has another shape or type, or they do not fit each other.
+            PolarguideError: an array has the wrong shape or type, or arrays do not fit each other.
         """
         check_count("downscale", downscale)
         check_choice("transfer", transfer, TRANSFERS)
@@ -278,12 +281,12 @@ class Scene:
             if isinstance(angles, Mapping)
             else dict.fromkeys(names, tuple(angles))
         )
-        beside = {
-            what: {} if arrays is None else by_name(arrays, what, names)
-            for what, arrays in (("masks", masks), ("invalid", invalid))
+        masks_of = {
+            kind: {} if arrays is None else by_name(arrays, kind, names)
+            for kind, arrays in (("masks", masks), ("invalid", invalid))
         }
         data = [
-            _view_of(each, values[each], posed[each], stated[each], beside, transfer, downscale)
+            _view_of(each, values[each], posed[each], stated[each], masks_of, transfer, downscale)
             for each in sorted(names)
         ]
         ready = {each: posed[each] if downscale == 1 else posed[each].downscaled(downscale) for each in names}
@@ -334,10 +337,10 @@ class Scene:
 
 
 def _sizes(views: Sequence[View]) -> str:
-    """The sizes of views, for people."""
+    """Format the range of the views' sizes."""
     sizes = sorted({(view.camera.width, view.camera.height) for view in views})
-    words = [f"{width}x{height}" for width, height in (sizes[0], sizes[-1])] if sizes else ["no"]
-    return " to ".join(dict.fromkeys(words))
+    texts = [f"{width}x{height}" for width, height in (sizes[0], sizes[-1])] if sizes else ["no"]
+    return " to ".join(dict.fromkeys(texts))
 
 
 def _view_of(
@@ -345,22 +348,22 @@ def _view_of(
     pictures: Array,
     camera: Camera,
     angles: Sequence[Angle],
-    beside: Mapping[str, Mapping[str, Array]],
+    masks_of: Mapping[str, Mapping[str, Array]],
     transfer: str,
     factor: int,
 ) -> ViewData:
-    """One view, checked.
+    """Check the arrays of a view and average its pictures.
 
     Raises:
-        PolarguideError: its arrays, its angles and its camera do not fit each other.
+        PolarguideError: arrays, angles and camera do not fit each other.
     """
     where = f"pictures ({name})"
     floats = np.issubdtype(as_numpy(pictures).dtype, np.floating)
     _require_array(
         not floats or transfer == "linear",
         where,
-        f"whole numbers, which transfer {transfer} decodes",
-        "floats, which are linear",
+        f"whole numbers, because transfer is {transfer}",
+        "floats, which must be linear",
     )
     stored = stored_pictures(pictures, where)
     exposures = exposures_of(angles, len(pictures), f"angles ({name})")
@@ -377,8 +380,8 @@ def _view_of(
         f"{camera.width}x{camera.height}",
     )
     masks = {
-        what: _mask(of_view.get(name), f"{what} ({name})", (height, width))
-        for what, of_view in beside.items()
+        kind: _mask(masks_of_view.get(name), f"{kind} ({name})", (height, width))
+        for kind, masks_of_view in masks_of.items()
     }
     return view_data(
         name,
@@ -404,18 +407,18 @@ def _mask(values: Array | None, where: str, size: tuple[int, int]) -> NDArray[np
 def _points_of(
     points: ArrayLike | Tensor, point_colors: ArrayLike | Tensor | None
 ) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Points [M, 3] float32 and their colors [M, 3] uint8, gray where there are none."""
+    """Return points [M, 3] float32 and their colors [M, 3] uint8, by default gray."""
     places = _rows(points, "points", np.float32)
     colors = np.full(places.shape, 128, np.uint8) if point_colors is None else point_colors
     shades = _rows(colors, "point_colors", np.uint8)
     _require_array(
-        len(shades) == len(places), "point_colors", f"{len(places)} rows, one a point", str(len(shades))
+        len(shades) == len(places), "point_colors", f"{len(places)} rows, one per point", str(len(shades))
     )
     return places, shades
 
 
 def _rows(values: Any, where: str, kind: type[np.generic]) -> NDArray[Any]:
-    """Rows of three finite numbers."""
+    """Check that an array has rows of three finite numbers."""
     array = as_numpy(values)
     _require_array(
         array.ndim == 2 and array.shape[1] == 3 and len(array) and np.isfinite(array).all(),
@@ -436,7 +439,7 @@ def _require_array(condition: object, where: str, expected: str, found: str) -> 
 def _digest(
     data: Sequence[ViewData], cameras: Mapping[str, Camera], more: Sequence[NDArray[Any]], how: object
 ) -> str:
-    """SHA-256 over all that a scene was made of."""
+    """Return the SHA-256 of all inputs of a scene."""
     digest = hashlib.sha256(repr(how).encode())
     for item in data:
         camera = cameras[item.name]
@@ -467,29 +470,29 @@ def load_scene(
 ) -> Scene:
     """Read a capture.
 
-    Two layouts are read: ``polar/<view>_000|_045|_090|_135.<suffix>``, and one folder per angle (``I-00``,
-    ``I-45``, ``I-90``, ``I-135``; also ``0``, ``045``, ``I_90``, ...) with equally named pictures. Pictures
-    are PNG, TIFF or JPEG with 8 or 16 bits, undistorted. Required is a COLMAP model in ``sparse/0`` or
-    ``sparse`` (the image's name without suffix is the view); optional are ``masks/<view>.png``,
-    ``invalid/<view>.png``, ``gt/<view>.npz``, ``split.json`` and ``scene.json``.
+    Two layouts are supported: ``polar/<view>_000|_045|_090|_135.<suffix>``, and one folder per angle (``I-00``,
+    ``I-45``, ``I-90``, ``I-135``; also ``0``, ``045``, ``I_90``, ...) with equally named pictures. Pictures are PNG,
+    TIFF or JPEG with 8 or 16 bits, undistorted. A COLMAP model in ``sparse/0`` or ``sparse`` is required; the name of
+    an image without suffix is the view. ``masks/<view>.png``, ``invalid/<view>.png``, ``gt/<view>.npz``, ``split.json``
+    and ``scene.json`` are optional.
 
     Args:
-        path: the capture folder.
-        downscale: average over boxes of this many pixels each way, on linear values. A pixel stays foreground
-            only where all of its box is; it is invalid or saturated where any of it is.
-        transfer: how the files are encoded: "linear", or "srgb" for display-encoded pictures.
-        views: names of the views to read; all if None. The split is that of the whole capture.
-        memory: GiB that the pictures may take; None: 80 % of what is free.
-        split: which views are held out where there is no ``split.json``, see ``scene.chosen_views``.
-        test_views: names of the views to hold out, whatever else says so, as far as there are such views.
-        hold: whether pictures stay in memory; otherwise views load theirs from the files when they are read.
-        reporter: receives the progress.
+        path: capture folder.
+        downscale: side of the pixel boxes over which linear values are averaged. A pixel is foreground if its whole box
+            is; it is invalid or saturated if any pixel of the box is.
+        transfer: encoding of the files, "linear" or "srgb".
+        views: names of the views to read; default: all. The split is that of the whole capture.
+        memory: memory limit of the pictures in GiB; default: 80 % of the free memory.
+        split: choice of held-out views for captures without ``split.json``, see ``scene.chosen_views``.
+        test_views: names of the held-out views, with precedence over ``split.json``. Missing views are ignored.
+        hold: if True, pictures stay in memory; otherwise views load them from files when they are needed.
+        reporter: reporter of the progress.
 
     Returns:
-        The scene; ``Scene.warnings`` lists possible faults that do not prevent its use.
+        The scene. ``Scene.warnings`` lists possible faults that do not prevent its use.
 
     Raises:
-        PolarguideError: a file of the capture cannot be used; the message names it and the remedy.
+        PolarguideError: a file of the capture is unusable; the message names the file and the remedy.
     """
     root = Path(path)
     check_count("downscale", downscale)
@@ -500,13 +503,13 @@ def load_scene(
     files = Files()
     for file in (*model.files, *([layout.table] if layout.table is not None else [])):
         files.read(file)
-    tests, stray = _held_out(root / "split.json", files, layout, model, split, test_views)
+    tests, split_warnings = _held_out(root / "split.json", files, layout, model, split, test_views)
     about = files.read_if_there(root / "scene.json", b"{}")
     index = refractive_index_of(root / "scene.json", about)
     indices = indices_of(root / "scene.json", about)
     mount = mount_of(root / "scene.json", about)
     for name in names:
-        # Missing poses and pictures of another size are found before a picture is decoded.
+        # Missing poses and wrong sizes are reported before any picture is decoded.
         camera = model.camera(name)
         size = stated_size(layout.files(name)[0])
         if size is not None:
@@ -522,24 +525,24 @@ def load_scene(
     require(
         not (counted and counted <= set(without_pixels)),
         root / "invalid",
-        expected="at least one pixel to train on that is not invalid",
+        expected="at least one valid pixel for training",
         found=f"none in {len(counted)} views",
-        remedy="White is invalid there: invert the pictures, or remove them.",
+        remedy="White means invalid: invert the pictures, or remove them.",
     )
     even = stored.exposures is None or keeps_gains(root / "scene.json", about)
     gains = [EVEN] * len(names) if even or stored.exposures is None else stored.exposures.gains()
-    stays = None if hold else ViewFiles(layout, downscale, transfer, files.digests)
+    loaders = None if hold else ViewFiles(layout, downscale, transfer, files.digests)
     posed_views = tuple(
-        item.view(camera, stored.full_scale, mount, stays, gain)
+        item.view(camera, stored.full_scale, mount, loaders, gain)
         for item, camera, gain in zip(stored.data, stored.cameras, gains, strict=True)
         if camera is not None
     )
     check_materials(layout, stored.data, indices)
-    told_apart = any(item.ground_truth and item.ground_truth.object_ids is not None for item in stored.data)
+    has_objects = any(item.ground_truth and item.ground_truth.object_ids is not None for item in stored.data)
     warnings = [
         *layout.warnings,
         *model.warnings,
-        *stray,
+        *split_warnings,
         *_content_warnings(layout, stored, without_pixels),
         *unseen_points(model.points, [camera for camera in stored.cameras if camera is not None]),
         *_pose_warnings(model, layout.names, stored.data),
@@ -557,7 +560,7 @@ def load_scene(
         transfer=transfer,
         digest=files.digest(root),
         warnings=(*warnings, *stored.picture_warnings(transfer)),
-        objects=objects_of(root / "scene.json", about) if told_apart else (),
+        objects=objects_of(root / "scene.json", about) if has_objects else (),
         indices=indices,
     )
 
@@ -565,33 +568,35 @@ def load_scene(
 def _held_out(
     path: Path,
     files: Files,
-    layout: Layout,
+    layout: CaptureFiles,
     model: ColmapModel,
     split: Split,
     test_views: Sequence[str] | None,
 ) -> tuple[tuple[str, ...], list[str]]:
-    """The names of the test views, and a warning where some are far from what is trained on, or a ring of them is."""
+    """Return the held-out views, and a warning if some are far from training views or fill a band of heights."""
     check_choice("split", split, get_args(Split))
     data = files.read_if_there(path, None)
     posed = frozenset(model.names)
     cameras = {name: model.camera(name) for name in layout.names if name in posed}
-    if test_views is not None:  # whoever asks has been told
+    if test_views is not None:  # the user's choice needs no warning
         return tuple(name for name in sorted(test_views) if name in layout.names), []
     tests = chosen_views(cameras, split) if data is None else held_out(path, data, layout.names)
     other = (
-        "take --split directions" if data is None and split != "directions" else "name others in split.json"
+        "use --split directions" if data is None and split != "directions" else "name others in split.json"
     )
     if far := far_from_training(cameras, tests):
-        what = f"{len(far)} of {len(tests)} test views are far from every training view ({listed(far)})"
+        fault = f"{len(far)} of {len(tests)} test views are far from every training view ({listed(far)})"
     elif band := held_out_band(cameras, tests):
-        what = f"{len(band)} of {len(tests)} test views are all of a band of heights, such as a ring ({listed(band)})"
+        fault = (
+            f"{len(band)} of {len(tests)} test views fill a band of heights, such as a ring ({listed(band)})"
+        )
     else:
         return tests, []
-    return tests, [f"{what}: scores on them measure extrapolation. If that is not meant, {other}."]
+    return tests, [f"{fault}: their scores measure extrapolation. If this is not intended, {other}."]
 
 
 def read_views(
-    layout: Layout,
+    layout: CaptureFiles,
     names: Sequence[str],
     model: ColmapModel | None,
     *,
@@ -600,19 +605,19 @@ def read_views(
     hold: bool = True,
     reporter: Reporter = SILENT,
 ) -> StoredViews:
-    """Read the files of some views, in several threads.
+    """Read the files of views in several threads.
 
     Args:
-        layout: the files of the capture.
-        names: names of the views to read, sorted.
-        model: the capture's COLMAP model, if it has one; views that it lacks are read without a camera.
-        downscale: side of the pixel boxes to average.
+        layout: files of the capture.
+        names: names of the views, sorted.
+        model: COLMAP model of the capture, if there is one. Views without a pose have no camera.
+        downscale: side of the averaged pixel boxes.
         transfer: "linear" or "srgb".
-        hold: whether to keep all codes and the ground truth; otherwise samples of them.
-        reporter: receives the progress.
+        hold: if True, all codes and the ground truth are kept; otherwise samples.
+        reporter: reporter of the progress.
 
     Raises:
-        PolarguideError: a file cannot be used, a camera does not fit its pictures, or the views differ in depth.
+        PolarguideError: a file is unusable, a camera does not fit its pictures, or the views differ in bit depth.
     """
 
     four = all(layout.exposures(name) == FOUR for name in names)
@@ -643,18 +648,20 @@ def read_views(
 
 
 def _without_pictures(data: ViewData) -> ViewData:
-    """The part of a view that ``read_views`` keeps if its pictures stay in their files."""
+    """Reduce a view to the part that stays in memory if its pictures are loaded from files."""
     truth = data.ground_truth
-    told_apart = truth is not None and truth.object_ids is not None
-    stub = GroundTruth(object_ids=torch.empty(0)) if told_apart else None
+    has_objects = truth is not None and truth.object_ids is not None
+    stub = GroundTruth(object_ids=torch.empty(0)) if has_objects else None
     return replace(data, codes=checks.sampled(data.codes), ground_truth=stub)
 
 
-def _content_warnings(layout: Layout, stored: StoredViews, invalid: list[str]) -> list[str]:
-    """Warnings about views whose pictures say nothing, or are those of another.
+def _content_warnings(layout: CaptureFiles, stored: StoredViews, invalid: list[str]) -> list[str]:
+    """Return warnings about views with useless pictures or with those of another view.
 
     Args:
-        layout: the files. stored: the views. invalid: those without a pixel to use.
+        layout: files of the capture.
+        stored: the views.
+        invalid: names of the views without a valid pixel.
     """
 
     def is_gray(picture: NDArray[np.uint16]) -> bool:
@@ -667,43 +674,43 @@ def _content_warnings(layout: Layout, stored: StoredViews, invalid: list[str]) -
         digests = tuple(item.digests[path] for path in layout.files(item.name))
         if item.peak.any():
             views.setdefault(digests, []).append(item.name)
-            if len(digests) > 1 and len(set(digests)) == 1:  # light without polarization has noise, too
+            if len(digests) > 1 and len(set(digests)) == 1:  # unpolarized light differs by noise
                 same_file.append(item.name)
-    # Views that are black altogether are counted by their exposure.
+    # Views with black pictures only are reported with their exposure.
     black = [item.name for item in stored.data if len({bool(picture.any()) for picture in item.codes}) > 1]
     gray = [item.name for item in stored.data if any(map(is_gray, item.codes))]
     copies = "; ".join(listed(names) for names in [n for n in views.values() if len(n) > 1][:3])
     table = (
-        (invalid, "are invalid at every pixel ({}): they tell nothing. White is invalid in invalid/: invert the "
-         "pictures, or remove them."),
-        (same_file, "have the same file at all angles ({}): they look unpolarized. Copy those of the other angles."),
+        (invalid, "have no valid pixel ({}) and are useless. White means invalid in invalid/: invert the pictures, or "
+         "remove them."),
+        (same_file, "have the same file at all angles ({}) and look unpolarized. Copy the files of the other angles."),
         (black, "have pictures that are black throughout ({})."),
-        (gray if len(gray) < count else [], "have gray pictures among others in color ({})."),
+        (gray if len(gray) < count else [], "have gray pictures, unlike other views ({})."),
     )  # fmt: skip
     warnings = [f"{len(n)} of {count} views {text.format(listed(n))}" for n, text in table if n]
     if copies:
         warnings.append(
-            f"Views have the same pictures ({copies}). Copy those of the other views, or leave them out."
+            f"Views have the same pictures ({copies}). Copy the files of the other views, or remove these views."
         )
     return warnings
 
 
 def _gain_warnings(names: Sequence[str], gains: Sequence[tuple[float, float, float]]) -> list[str]:
-    """The warning that views were exposed differently."""
+    """Return a warning about views with a different exposure or white balance."""
     stops = {name: np.log2(gain) for name, gain in zip(names, gains, strict=True) if gain != EVEN}
     if not stops:
         return []
     strongest = sorted(stops, key=lambda name: -float(np.abs(stops[name]).max()))
-    told = [f"{name} {max(stops[name], key=abs):+.2f}" for name in strongest]
+    texts = [f"{name} {max(stops[name], key=abs):+.2f}" for name in strongest]
     return [
-        f"{len(stops)} of {len(names)} views were exposed or white-balanced otherwise than the mean, by points in "
-        f"common (stops: {listed(told)}). Each color of theirs is divided by its gain; fix exposure and white balance "
-        "next time."
+        f"{len(stops)} of {len(names)} views differ from the mean exposure or white balance, measured at common points "
+        f"(stops: {listed(texts)}). Their colors are divided by the gains. Fix exposure and white balance in the next "
+        "capture."
     ]
 
 
 def _pose_warnings(model: ColmapModel, all_names: list[str], data: Sequence[ViewData]) -> list[str]:
-    """Warnings about poses without pictures, and about intrinsics that were scaled to the pictures."""
+    """Return warnings about poses without pictures, and about intrinsics that were scaled to the pictures."""
     warnings = unused_poses(model, all_names)
     sizes = {item.name: (model.camera(item.name).width, model.camera(item.name).height) for item in data}
     scaled = [item.name for item in data if item.size != sizes[item.name]]
@@ -712,8 +719,8 @@ def _pose_warnings(model: ColmapModel, all_names: list[str], data: Sequence[View
             f"{width}x{height}" for width, height in sorted({sizes[name] for name in scaled})
         )
         warnings.append(
-            f"The intrinsics were made for another resolution ({resolutions}) than that of the pictures and were "
-            f"scaled in {len(scaled)} of {len(data)} views ({listed(scaled)}): right if the pictures were "
-            "resized, wrong if they were cropped."
+            f"The intrinsics are for another resolution ({resolutions}) than the pictures and were scaled in "
+            f"{len(scaled)} of {len(data)} views ({listed(scaled)}). This is right for resized pictures, wrong for "
+            "cropped pictures."
         )
     return warnings

@@ -1,4 +1,4 @@
-"""Scenes made of a scene: on black, with fewer pictures of each view, or with smaller ones."""
+"""Variants of a scene: with a masked background, with fewer pictures per view, or with smaller pictures."""
 
 from __future__ import annotations
 
@@ -25,38 +25,37 @@ from polarguide.geometry.camera import seen_at
 from polarguide.geometry.polarizer import ANGLES
 
 BLACK = 0.005
-"""Linear S0/2 up to which a pixel is black: a little over one step of 8 bits, which is what noise and rounding leave of
-no light."""
+"""Linear S0/2 of black pixels: a little over one step of 8 bits, because of noise and rounding."""
 BLACK_EDGE = 0.95
-"""Share of a picture's outermost pixels that are black where there is nothing behind the subject."""
+"""Share of black pixels at the edge of a picture with a black background."""
 BLACK_VIEWS = 0.9
-"""Share of the views whose edge has to be black."""
+"""Share of the views that must have a black edge."""
 GROWN = 3
-"""Pixels by which a subject is grown before what is outside counts as empty: edges are blended."""
+"""Dilation of a subject in pixels before the rest counts as empty, because edges are blended."""
 INSIDE = 0.8
-"""A point belongs to the subject if it is in the mask in this share of the pictures that see it."""
+"""Share of the pictures with a point in their field of view that must have it in the mask."""
 
 
 def black_pixels(view: View) -> Tensor:
-    """Where the photograph shows no light, [H, W] bool, on the CPU: what *black* means wherever pictures are judged.
+    """Return a mask of the black pixels of a photograph, [H, W] bool on the CPU.
 
-    It is the mean over the color channels and 3 x 3 pixels that is compared, so that noise does not lighten a pixel.
+    The mean over color channels and 3 x 3 pixels is compared, which suppresses noise.
     """
     picture = view.photograph().cpu().mean(dim=-1).numpy()
     return torch.from_numpy(np.asarray(cv2.blur(picture, (3, 3)) <= BLACK))
 
 
 def has_black_background(views: Sequence[View]) -> bool:
-    """Whether nothing is behind the subject: the edges of nearly all pictures are black, see ``BLACK_EDGE``."""
+    """Return True if nearly all pictures have a black edge, see ``BLACK_EDGE``."""
     black = sum(_black_edge(view) for view in views)
     return bool(views) and black >= BLACK_VIEWS * len(views)
 
 
 def empty_pixels(view: View) -> Tensor:
-    """Where a picture of a subject before black shows nothing, [H, W] bool.
+    """Return a mask of the empty pixels around a subject in front of black, [H, W] bool.
 
-    That is outside its mask, where it has one; elsewhere the black that reaches the edge of the picture, so that a dark
-    spot of the subject is not taken for a hole. The subject is grown by ``GROWN`` pixels.
+    These are the pixels outside the view's mask. Without a mask, they are the black regions at the edge of the picture,
+    so that a dark spot of the subject is no hole. The subject is dilated by ``GROWN`` pixels.
     """
     if view.mask is not None:
         subject = view.mask.cpu().numpy()
@@ -68,10 +67,10 @@ def empty_pixels(view: View) -> Tensor:
 
 
 def mask_background(scene: Scene) -> Scene:
-    """The scene with black pictures outside the masks, and with the points of the subject only.
+    """Return the scene with black pixels outside the masks, and with the points of the subject only.
 
     Raises:
-        PolarguideError: a view has no mask, or no point lies in the masks.
+        PolarguideError: a view has no mask, or no point is in the masks.
     """
     views = []
     for view in scene.views:
@@ -83,14 +82,14 @@ def mask_background(scene: Scene) -> Scene:
                 remedy=f"Add masks/{view.name}.png, white where the subject is, or choose another background.",
             )
         views.append(view.masked())
-    # The masks of test views tell training nothing.
+    # Training must not use the masks of held-out views.
     inside = _in_masks(scene.points, [view for view in views if view.name not in scene.test_names])
     require(
         not len(scene.points) or bool(inside.any()),
         scene.root / "masks",
         expected="masks with points of the COLMAP model in them",
         found=f"none of {len(scene.points)} points",
-        remedy="White is the subject there: invert the masks, or choose another background.",
+        remedy="White is the subject: invert the masks, or choose another background.",
     )
     return replace(
         scene, views=tuple(views), points=scene.points[inside], point_colors=scene.point_colors[inside]
@@ -98,7 +97,7 @@ def mask_background(scene: Scene) -> Scene:
 
 
 def _in_masks(points: Tensor, views: Sequence[View]) -> Tensor:
-    """Which points [M, 3] lie in the grown masks of most of the pictures that they fall into, [M] bool."""
+    """Return a mask [M] of the points [M, 3] in the dilated masks of most pictures that see them."""
     counts = torch.zeros(len(points))
     inside = torch.zeros(len(points))
     for view in views:
@@ -111,53 +110,56 @@ def _in_masks(points: Tensor, views: Sequence[View]) -> Tensor:
 
 
 def _black(view: View) -> NDArray[np.bool_]:
-    """Where the picture is black, [H, W]; pixels marked as invalid count as black."""
+    """Return a mask of black or invalid pixels, [H, W]."""
     return (black_pixels(view) | view.invalid.cpu()).numpy()
 
 
 def _black_edge(view: View) -> bool:
+    """Return True if the edge of a picture is black, but not the whole picture."""
     black = _black(view)
     edge = np.concatenate([black[0], black[-1], black[1:-1, 0], black[1:-1, -1]])
     return bool(edge.mean() >= BLACK_EDGE) and not bool(black.all())
 
 
 def _grown(mask: NDArray[np.bool_], pixels: int) -> NDArray[np.bool_]:
+    """Dilate a mask by a disk."""
     disk = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * pixels + 1, 2 * pixels + 1))
     return np.asarray(cv2.dilate(mask.astype(np.uint8), disk) > 0)
 
 
 THREE = (0.0, 60.0, 120.0)
+"""Angles of ``three`` in degrees."""
 EVERY = 4
-"""``mixed`` and ``sparse`` keep the four pictures of one view in this number."""
+"""Period of the views with four pictures in ``mixed`` and ``sparse``."""
 
 Change = Callable[[View, int], View | None]
-"""A training view with other pictures, given its place among the training views; None: the view is left out."""
+"""Function of a training view and its index that returns the view with other pictures, or None to remove it."""
 
 
 def select_exposures(scene: Scene, exposures: Exposures) -> Scene:
-    """The scene with other pictures of its training views; those held out stay as they are.
+    """Return the scene with other pictures of its training views. Held-out views do not change.
 
     Args:
-        scene: with pictures at 0, 45, 90 and 135 degrees of every training view.
-        exposures: ``captured``: the scene as it is. ``four``: all four pictures. ``three``: at 0, 60 and 120 degrees,
-            computed from the Stokes vectors. ``two``: a pair at right angles, 0 and 90 or 45 and 135 in turn. ``one``:
-            one picture, at 0, 45, 90, 135 in turn. ``unknown``: the same with unknown angles. ``mixed``: all four of
-            every fourth view, S0/2 of the others. ``sparse``: every fourth view alone. ``none``: S0/2.
+        scene: scene with pictures at 0, 45, 90 and 135 degrees of every training view.
+        exposures: ``captured``: no change. ``four``: all four pictures. ``three``: at 0, 60 and 120 degrees, computed
+            from the Stokes vectors. ``two``: a pair at right angles, 0 and 90 or 45 and 135 in turn. ``one``: one
+            picture, at 0, 45, 90, 135 in turn. ``unknown``: the same with unknown angles. ``mixed``: all four of every
+            fourth view, S0/2 of the others. ``sparse``: only every fourth view. ``none``: S0/2.
 
     Raises:
-        PolarguideError: there is no such choice, or the scene has other pictures.
+        PolarguideError: the choice is invalid, or the scene has other pictures.
     """
     check_choice("exposures", exposures, EXPOSURES)
     if exposures == "captured":
         return scene
     others = [view.name for view in scene.train_views if view.exposures != FOUR]
-    if others:
-        raise PolarguideError(
-            scene.root,
-            expected=f"four pictures of every view, at 0, 45, 90 and 135 degrees, for --exposures {exposures}",
-            found=f"{len(others)} views without them ({others[0]} first)",
-            remedy="Use a scene with these four pictures of every view.",
-        )
+    require(
+        not others,
+        scene.root,
+        expected=f"four pictures of every view, at 0, 45, 90 and 135 degrees, for --exposures {exposures}",
+        found=f"{len(others)} views without them ({', '.join(others[:4])})",
+        remedy="Use a scene with these four pictures of every view.",
+    )
     places = {view.name: place for place, view in enumerate(scene.train_views)}
     change = _CHANGES[exposures]
     views = [change(view, places[view.name]) if view.name in places else view for view in scene.views]
@@ -165,19 +167,24 @@ def select_exposures(scene: Scene, exposures: Exposures) -> Scene:
 
 
 def _some(view: View, *places: int, known: bool = True) -> View:
+    """Return a view with some of its four pictures."""
     chosen = tuple(FOUR[place] if known else Exposure() for place in places)
     return view.changed(lambda codes: torch.stack([codes[place] for place in places]), chosen)
 
 
 def _computed(view: View, pictures: Callable[[View], list[Tensor]], exposures: tuple[Exposure, ...]) -> View:
+    """Return a view with computed pictures."""
+
     def change(codes: Tensor) -> Tensor:
-        made = torch.stack(pictures(replace(view, pictures=codes, gains=EVEN))).clamp(0, 1) * FULL_CODE
-        return made.round().to(torch.int32).to(torch.uint16)
+        new = torch.stack(pictures(replace(view, pictures=codes, gains=EVEN))).clamp(0, 1) * FULL_CODE
+        return new.round().to(torch.int32).to(torch.uint16)
 
     return view.changed(change, exposures)
 
 
 def _three(view: View, _place: int) -> View:
+    """Return a view with pictures at 0, 60 and 120 degrees."""
+
     def pictures(view: View) -> list[Tensor]:
         stokes = view.stokes()
         rays = view.camera.rays()
@@ -191,6 +198,7 @@ def _three(view: View, _place: int) -> View:
 
 
 def _plain(view: View, _place: int) -> View:
+    """Return a view with S0/2 as its only picture."""
     return _computed(view, lambda view: [view.photograph()], PLAIN)
 
 
@@ -207,16 +215,18 @@ _CHANGES: dict[str, Change] = {
 
 
 def smaller_view(view: View, factor: int, latest: Latest) -> View:
-    """A view averaged over boxes of pixels, as if it had been read so; its codes are made when they are read.
+    """Return a view averaged over boxes of pixels, like ``load_scene(downscale=factor)``. Codes are computed on demand.
 
-    Codes are averaged; they are linear, so Stokes vectors are averaged, and angles never are. A pixel is invalid or
-    saturated where any pixel of its box is; it belongs to the mask or to a material where all are. Incomplete boxes at
-    the right and bottom are dropped. The view has no ground truth.
+    Linear codes are averaged, and so are Stokes vectors, but not angles. A pixel is invalid or saturated if any pixel
+    of its box is. It belongs to the mask or to a material if all are. Incomplete boxes at the right and bottom are
+    dropped. The view has no ground truth.
 
     Args:
-        view: the whole view. factor: side of the boxes in pixels. latest: where the codes of a view in memory stay.
+        view: the view at full size.
+        factor: side of the boxes in pixels.
+        latest: cache of the codes of views in memory.
     """
-    whole = view.pictures
+    full = view.pictures
 
     def averaged(codes: Tensor) -> Tensor:
         return torch.from_numpy(np.stack([mean_codes(picture, factor) for picture in codes.numpy()]))
@@ -227,9 +237,7 @@ def smaller_view(view: View, factor: int, latest: Latest) -> View:
     return replace(
         view,
         camera=view.camera.downscaled(factor),
-        pictures=whole.then(averaged)
-        if isinstance(whole, Loader)
-        else Loader(lambda: averaged(whole), latest),
+        pictures=full.then(averaged) if isinstance(full, Loader) else Loader(lambda: averaged(full), latest),
         invalid=boxed(view.invalid, maximum),
         saturated=boxed(view.saturated, maximum),
         mask=None if view.mask is None else boxed(view.mask, every),
@@ -239,7 +247,7 @@ def smaller_view(view: View, factor: int, latest: Latest) -> View:
 
 
 class SmallerViews(Sequence[View]):
-    """Views averaged over boxes of pixels, each made at its first use."""
+    """Lazy sequence of views averaged over boxes of pixels."""
 
     def __init__(self, views: Sequence[View], factor: int) -> None:
         self._views = views
@@ -251,7 +259,7 @@ class SmallerViews(Sequence[View]):
         return len(self._views)
 
     def __getitem__(self, place):  # type: ignore[no-untyped-def]
-        """The view at a place, or those of a slice."""
+        """Return the view at an index, or the views of a slice."""
         if isinstance(place, slice):
             return [self[k] for k in range(*place.indices(len(self)))]
         place = range(len(self))[place]
@@ -261,12 +269,9 @@ class SmallerViews(Sequence[View]):
 
 
 def smaller(scene: Scene, longest: int) -> Scene:
-    """The training views averaged until none has a side longer than ``longest`` pixels, see ``smaller_view``.
+    """Return the training views of a scene, averaged until no side is longer than ``longest`` pixels.
 
-    It has neither masks nor ground truth, nor the views that are held out.
-
-    Returns:
-        The scene itself where its pictures are small enough.
+    The result has no masks, ground truth or held-out views. A scene with small pictures is returned as it is.
     """
     views = scene.train_views
     size = max(max(view.camera.width, view.camera.height) for view in views)

@@ -1,4 +1,4 @@
-"""A view of a capture: one camera pose with its pictures, mostly four behind a polarizer."""
+"""A view of a capture: a camera pose with its pictures, usually four at different polarizer angles."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ from polarguide.optics import Mount
 from polarguide.optics.color import srgb_encode_array
 
 _WIDTH = 160
-"""Pixels of a thumbnail."""
+"""Width of a thumbnail in pixels."""
 
 
 def figure(radiance: NDArray[Any], caption: str) -> str:
-    """A picture of linear radiance [H, W, 3] as a thumbnail with a caption; white is its 99th percentile at most."""
+    """Return linear radiance [H, W, 3] as HTML thumbnail with a caption. White is its 99th percentile, at most 1."""
     white = min(1.0, max(float(np.percentile(radiance, 99)), 1e-6))
     shades = srgb_encode_array(np.clip(radiance / white, 0, 1)) * 255
     height, width = shades.shape[:2]
@@ -53,7 +53,7 @@ def figure(radiance: NDArray[Any], caption: str) -> str:
 
 
 def table(title: str, facts: Mapping[str, str]) -> str:
-    """Facts in two columns, below a title."""
+    """Return facts as an HTML table of two columns with a title."""
     rows = "".join(
         f'<tr><th style="text-align:left">{html.escape(name)}</th>'
         f'<td style="text-align:left;white-space:pre-line">{html.escape(text)}</td></tr>'
@@ -66,21 +66,22 @@ T = TypeVar("T")
 
 
 class Latest:
-    """Room for one value: the last one that any of the loaders which share it made."""
+    """Cache of one value, the last result of all loaders that share it."""
 
     def __init__(self) -> None:
         self.loaded: tuple[object, Any] | None = None
 
 
 class Loader(Generic[T]):
-    """Makes a value when it is called.
+    """Lazy value of a view with a shared cache.
 
-    Views are worked on one after the other, and each is read several times. So the last value stays in ``latest``, and
-    those of all other views take no memory.
+    Views are processed one after the other, and each is read several times. ``latest`` keeps only the last value, so
+    other views take no memory.
 
     Args:
-        make: makes the value. latest: shared by all loaders of a scene.
-        derived: whether ``make`` calls another loader of ``latest``, which clears it where it has to.
+        make: function that creates the value.
+        latest: cache that all loaders of a scene share.
+        derived: True if ``make`` calls another loader of the same cache, which then clears it.
     """
 
     def __init__(self, make: Callable[[], T], latest: Latest, *, derived: bool = False) -> None:
@@ -89,11 +90,11 @@ class Loader(Generic[T]):
         self._derived = derived
 
     def __call__(self) -> T:
-        """The value."""
+        """Return the value."""
         latest = self._latest.loaded
         if latest is not None and latest[0] is self:
             return latest[1]
-        del latest  # so that its memory can be taken for the next
+        del latest  # frees its memory for the next value
         if not self._derived:
             self._latest.loaded = None
         value = self._make()
@@ -101,36 +102,36 @@ class Loader(Generic[T]):
         return value
 
     def then(self, change: Callable[[T], T]) -> Loader[T]:
-        """A loader of the value after a change."""
+        """Return a loader of the changed value."""
         return Loader(lambda: change(self()), self._latest, derived=True)
 
 
 EVEN = (1.0, 1.0, 1.0)
-"""Gains of a view that is exposed like the others."""
+"""Gains of a view with the mean exposure."""
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """One camera pose with its pictures, mostly four behind a polarizer, and masks of their pixels.
+    """Camera pose with its pictures, usually four at different polarizer angles, and masks of their pixels.
 
-    Everything lies on one device. ``dataclasses.replace`` and the methods that give another view load no pictures.
+    All tensors are on one device. ``dataclasses.replace`` and methods that return another view load no pictures.
 
     Attributes:
         name: name of the view, unique in its scene.
         camera: pose and intrinsics at the size of the pictures.
-        pictures: ``codes`` where they are in memory, else what loads them.
+        pictures: ``codes`` in memory, or their loader.
         invalid: pixels that the capture marks as unusable (``invalid/<view>.png``), [H, W] bool. Metrics exclude these
-            pixels and no others.
+            pixels only.
         saturated: pixels without polarization information: one angle at full scale in any channel, or all
             black; [H, W] bool. Priors and losses exclude them.
-        mask: the user's foreground mask (``masks/<view>.png``), [H, W] bool, or None.
-        truth: ``ground_truth`` where it is in memory, else what loads it.
-        exposures: what the K pictures are.
-        mount: where the polarizer was.
-        materials: the user's labels of surfaces (``materials/<view>.png``), [H, W] uint8, or None: 0 no label,
-            1 dielectric, 2 metal; from 3 on, a dielectric whose refractive index is ``Scene.indices[number]``.
-        subject_only: whether ``codes`` are 0 outside the mask, which then is needed.
-        gains: exposure of R, G and B relative to other views, beside those of ``exposures``.
+        mask: foreground mask of the user (``masks/<view>.png``), [H, W] bool, or None.
+        truth: ``ground_truth`` in memory, or its loader.
+        exposures: polarizer angle and gain of each of the K pictures.
+        mount: place of the polarizer.
+        materials: surface labels of the user (``materials/<view>.png``), [H, W] uint8, or None: 0 no label,
+            1 dielectric, 2 metal; from 3 on, a dielectric with the refractive index ``Scene.indices[number]``.
+        subject_only: if True, ``codes`` are 0 outside the mask.
+        gains: exposure of R, G and B relative to other views, in addition to ``exposures``.
     """
 
     name: str
@@ -148,8 +149,9 @@ class View:
 
     @property
     def codes(self) -> Tensor:
-        """Linear intensities of the exposures, at 0, 45, 90 and 135 degrees unless ``exposures`` differ, coded as
-        round(65535 * intensity), [K, H, W, 3] uint16, RGB. Coded because large captures do not fit into memory as
+        """Linear intensities of the exposures as codes round(65535 * intensity), [K, H, W, 3] uint16, RGB.
+
+        The angles are 0, 45, 90 and 135 degrees unless ``exposures`` differ. Large captures do not fit into memory as
         floats.
 
         Raises:
@@ -171,41 +173,41 @@ class View:
 
     def __repr__(self) -> str:
         size = f"{self.camera.width}x{self.camera.height}"
-        angles = ", ".join(e.words for e in self.exposures)
-        beside = {"mask": self.mask, "materials": self.materials, "ground truth": self.truth}
-        more = ", ".join(name for name, there in beside.items() if there is not None) or "no mask"
+        angles = ", ".join(e.label for e in self.exposures)
+        optional = {"mask": self.mask, "materials": self.materials, "ground truth": self.truth}
+        parts = ", ".join(name for name, value in optional.items() if value is not None) or "no mask"
         return (
             f"<View {self.name}: {size} pixels, {len(self.exposures)} pictures ({angles})\n"
-            f" {more}; {float(self.invalid.float().mean()):.1%} invalid, "
+            f" {parts}; {float(self.invalid.float().mean()):.1%} invalid, "
             f"{float(self.saturated.float().mean()):.1%} without polarization>"
         )
 
     def _repr_html_(self) -> str:
-        facts = {"pictures": ", ".join(exposure.words for exposure in self.exposures), "state": repr(self)}
+        facts = {"pictures": ", ".join(exposure.label for exposure in self.exposures), "state": repr(self)}
         return figure(self.photograph().cpu().numpy(), self.name) + table(self.name, facts)
 
     @property
     def device(self) -> torch.device:
-        """Where the tensors are."""
+        """Device of the tensors."""
         return self.invalid.device
 
     @property
     def is_four(self) -> bool:
-        """Whether it has the four pictures of a polarization camera."""
+        """True for the four pictures of a polarization camera."""
         return self.mount == "sensor" and self.exposures == FOUR
 
     @property
     def is_determined(self) -> bool:
-        """Whether its pictures determine a Stokes vector at every pixel."""
+        """True if the pictures determine a Stokes vector at every pixel."""
         return self.exposures == FOUR or determine_stokes(self.exposures)
 
     @property
     def measures_radiance(self) -> bool:
-        """Whether its pictures measure S0."""
+        """True if the pictures measure S0."""
         return self.exposures == FOUR or measure_radiance(self.exposures)
 
     def to(self, device: torch.device) -> View:
-        """The view on a device, without its ground truth; the view itself if it is already there."""
+        """Return the view on a device, without ground truth; the view itself if it is already there."""
         if self.device == device:
             return self
         moved = self.changed(lambda codes: codes.to(device))
@@ -221,27 +223,29 @@ class View:
     def changed(
         self, change: Callable[[Tensor], Tensor], exposures: tuple[Exposure, ...] | None = None
     ) -> View:
-        """The view with other pictures: made now where its own are in memory, else when they are read.
+        """Return the view with other pictures, which are computed now if the view's are in memory, else on demand.
 
         Args:
-            change: makes new codes of the view's. exposures: exposures of the new pictures; None: they stay.
+            change: function that computes new codes from those of the view.
+            exposures: exposures of the new pictures; default: unchanged.
         """
         pictures = self.pictures
-        made = pictures.then(change) if isinstance(pictures, Loader) else change(pictures)
-        return replace(self, pictures=made, exposures=self.exposures if exposures is None else exposures)
+        new = pictures.then(change) if isinstance(pictures, Loader) else change(pictures)
+        return replace(self, pictures=new, exposures=self.exposures if exposures is None else exposures)
 
     def with_exposures(self, exposures: tuple[Exposure, ...]) -> View:
-        """The view with other knowledge of its pictures."""
+        """Return the view with other exposures of the same pictures."""
         return replace(self, exposures=exposures)
 
     def masked(self) -> View:
-        """The view with black pixels outside its mask, which it has to have."""
+        """Return the view with black pixels outside its mask, which is required."""
         assert self.mask is not None
         return replace(self, subject_only=True)
 
     def intensities(self) -> Tensor:
-        """Linear intensities of the exposures (0, 45, 90, 135 degrees mostly) on one scale, in [0, 1] unless their
-        gains differ: [K, H, W, 3] float32.
+        """Return linear intensities of the exposures on one scale, [K, H, W, 3] float32.
+
+        They are in [0, 1] unless gains differ.
         """
         intensities = self._even(self.codes.to(torch.float32) / FULL_CODE)
         gains = [exposure.gain for exposure in self.exposures]
@@ -250,14 +254,14 @@ class View:
         return intensities / intensities.new_tensor(gains)[:, None, None, None]
 
     def _even(self, intensities: Tensor) -> Tensor:
-        """Intensities [..., 3] on the scale of the scene's other views."""
+        """Divide intensities [..., 3] by the gains of the view."""
         return intensities if self.gains == EVEN else intensities / intensities.new_tensor(self.gains)
 
     def stokes(self) -> Tensor:
-        """Stokes vectors [3, H, W, 3] in the lens frame, by least squares.
+        """Return Stokes vectors [3, H, W, 3] in the lens frame, by least squares.
 
         Raises:
-            PolarguideError: the pictures do not determine them; ``is_determined`` tells before.
+            PolarguideError: the pictures do not determine them, see ``is_determined``.
         """
         if self.is_four:
             return optics.stokes(self.intensities())
@@ -269,9 +273,9 @@ class View:
         return optics.fitted_stokes(self.intensities()[places], rows)
 
     def photograph(self) -> Tensor:
-        """Linear S0 / 2 in [0, 1], [H, W, 3] float32: of four pictures, their mean.
+        """Return linear S0 / 2 in [0, 1], [H, W, 3] float32: the mean of the four pictures.
 
-        Where the pictures do not measure S0 (``measures_radiance``), it is the mean of what there is.
+        If the pictures do not measure S0 (see ``measures_radiance``), it is the mean of those with the most light.
         """
         if self.is_four:
             return self._even(self.codes.to(torch.float32).mean(dim=0) / FULL_CODE)
@@ -281,8 +285,8 @@ class View:
         return (self.intensities()[list(places)] if places else self.intensities()).mean(dim=0)
 
     def undetermined(self, what: str) -> PolarguideError:
-        """The error that the pictures do not determine ``what``."""
-        angles = ", ".join(exposure.words for exposure in self.exposures)
+        """Return the error that the pictures do not determine a quantity."""
+        angles = ", ".join(exposure.label for exposure in self.exposures)
         return PolarguideError(
             f"view {self.name}",
             expected=f"pictures that determine {what}: at three or more angles that differ enough",

@@ -1,4 +1,4 @@
-"""Pictures that come as arrays: checked, and brought to what a decoder gives of files."""
+"""Read views from files, and check pictures in arrays."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from polarguide.capture.formats.pictures import (
     linear_codes,
     read_picture,
 )
-from polarguide.capture.layout import Layout
+from polarguide.capture.layout import CaptureFiles
 from polarguide.capture.metadata import GroundTruth, read_ground_truth
 from polarguide.capture.point_exposures import ComparedPoints, PointExposures, PointSamples
 from polarguide.capture.view import EVEN, FULL_CODE, Latest, Loader, View
@@ -39,25 +39,26 @@ from polarguide.geometry.camera import Camera
 from polarguide.optics import Mount
 
 Array = NDArray[Any] | Tensor
-"""NumPy's or torch's, on any device."""
+"""Array of NumPy, or tensor of torch on any device."""
 _PICTURES = "pictures [K, H, W] or [K, H, W, 3] of uint8, uint16, or linear floats from 0 to 1"
 
 
 def as_numpy(values: ArrayLike | Tensor) -> NDArray[Any]:
-    """An array, or a tensor of any device, as NumPy's; no copy where none is needed."""
+    """Convert an array or a tensor on any device to NumPy, without a copy if possible."""
     return values.detach().cpu().numpy() if isinstance(values, Tensor) else np.asarray(values)
 
 
 def kind_of(array: NDArray[Any]) -> str:
-    """Type and shape, for messages."""
+    """Describe type and shape for messages."""
     return f"{array.dtype} of shape {list(array.shape)}"
 
 
 def stored_pictures(pictures: Array, where: str) -> NDArray[Any]:
-    """Pictures as a decoder gives them: [K, H, W, 3] uint8 or uint16. Floats become codes of 16 bits.
+    """Convert pictures to stored values [K, H, W, 3] uint8 or uint16. Floats become 16-bit codes.
 
     Args:
-        pictures: [K, H, W] or [K, H, W, 3]. where: what messages call them.
+        pictures: [K, H, W] or [K, H, W, 3].
+        where: name of the pictures for messages.
 
     Raises:
         PolarguideError: the pictures have another shape or type, or floats outside 0 to 1.
@@ -85,10 +86,10 @@ def stored_pictures(pictures: Array, where: str) -> NDArray[Any]:
 
 
 def codes_of_floats(values: NDArray[Any], where: str) -> NDArray[np.uint16]:
-    """Linear floats as codes of 16 bits, 1 at full scale.
+    """Convert linear floats, 1 at full scale, to 16-bit codes.
 
     Raises:
-        PolarguideError: one is outside 0 to 1, or not a number.
+        PolarguideError: a value is outside 0 to 1, or not a number.
     """
     low = float(values.min())
     high = float(values.max())
@@ -103,17 +104,17 @@ def codes_of_floats(values: NDArray[Any], where: str) -> NDArray[np.uint16]:
 
 
 def exposures_of(angles: Sequence[Angle], count: int, where: str) -> tuple[Exposure, ...]:
-    """The exposures of ``count`` pictures at some angles, in their order.
+    """Return the exposures of ``count`` pictures by their angles.
 
     Raises:
-        PolarguideError: there are more or fewer angles, or one is neither a number nor a word.
+        PolarguideError: the number of angles differs, or an angle is invalid.
     """
     require(
         len(angles) == count,
         where,
-        expected=f"{count} angles, one a picture",
+        expected=f"{count} angles, one per picture",
         found=str(len(angles)),
-        remedy="Name an angle in degrees, unknown or none for each picture.",
+        remedy="Specify an angle in degrees, unknown or none for each picture.",
     )
     return tuple(_exposure(angle, where) for angle in angles)
 
@@ -130,7 +131,7 @@ def _exposure(angle: Angle, where: str) -> Exposure:
         where,
         expected=f"angles in degrees up to {LARGEST:g}, unknown or none",
         found=repr(angle),
-        remedy="Give the angle in degrees, or None where it is not known.",
+        remedy="Specify the angle in degrees, or unknown.",
     )
     return Exposure(normalized(degrees))
 
@@ -138,44 +139,44 @@ def _exposure(angle: Angle, where: str) -> Exposure:
 def in_order(
     stored: NDArray[Any], exposures: tuple[Exposure, ...]
 ) -> tuple[NDArray[Any], tuple[Exposure, ...]]:
-    """Pictures at 0, 45, 90 and 135 degrees in this order, in which a polarization camera's are; others as they are."""
+    """Sort pictures at 0, 45, 90 and 135 degrees into this order; other pictures stay as they are."""
     if exposures != FOUR and len(exposures) == len(FOUR) and {*exposures} == {*FOUR}:
         return stored[[exposures.index(each) for each in FOUR]], FOUR
     return stored, exposures
 
 
 def by_name(
-    values: Mapping[str, Any] | Sequence[Any] | Array, what: str, names: Sequence[str] = ()
+    values: Mapping[str, Any] | Sequence[Any] | Array, kind: str, names: Sequence[str] = ()
 ) -> dict[str, Any]:
-    """Values by view: of a mapping, or in the order of ``names``; without those, views are called v000, v001, ...
+    """Return values by view, of a mapping or in the order of ``names``. The default names are v000, v001, ...
 
     Raises:
-        PolarguideError: there are others than of ``names``, or none.
+        PolarguideError: the names differ from ``names``, or there are no values.
     """
     if isinstance(values, Mapping):
-        found = {str(name): value for name, value in values.items()}
+        result = {str(name): value for name, value in values.items()}
     else:
         labels = names if names and len(names) == len(values) else [f"v{k:03d}" for k in range(len(values))]
-        found = dict(zip(labels, values, strict=True))
-    if not found or (names and sorted(found) != sorted(names)):
-        others = len(found) == len(names) > 0
+        result = dict(zip(labels, values, strict=True))
+    if not result or (names and sorted(result) != sorted(names)):
+        renamed = len(result) == len(names) > 0
         raise PolarguideError(
-            what,
+            kind,
             expected=f"one for each of the {len(names)} views" if names else "at least one view",
-            found=f"others: {', '.join(sorted(found)[:4])}" if others else str(len(found)),
-            remedy="Give them in the order of the pictures, or by the names of the views.",
+            found=f"others: {', '.join(sorted(result)[:4])}" if renamed else str(len(result)),
+            remedy="Pass them in the order of the pictures, or by the names of the views.",
         )
-    return found
+    return result
 
 
 T = TypeVar("T")
 
 
 class Files:
-    """Reads files and records the SHA-256 of each.
+    """Reader of files that records their SHA-256.
 
     Args:
-        known: SHA-256 that the files have to have; None: any.
+        known: required SHA-256 of the files; default: any.
     """
 
     def __init__(self, known: Mapping[Path, str] | None = None) -> None:
@@ -183,51 +184,50 @@ class Files:
         self._known = known
 
     def read(self, path: Path, largest: int = LARGEST_FILE) -> bytes:
-        """The bytes of a file of up to ``largest``."""
-        return self._noted(path, read_file(path, largest=largest))
+        """Read a file of up to ``largest`` bytes."""
+        return self._recorded(path, read_file(path, largest=largest))
 
     def picture(self, path: Path) -> bytes:
-        """The bytes of a picture file."""
-        return self._noted(path, read_picture(path))
+        """Read a picture file."""
+        return self._recorded(path, read_picture(path))
 
-    def _noted(self, path: Path, data: bytes) -> bytes:
+    def _recorded(self, path: Path, data: bytes) -> bytes:
         digest = self.digests[path] = hashlib.sha256(data).hexdigest()
         require(
             self._known is None or self._known[path] == digest,
             path,
-            expected="the file that was there as the scene was read",
+            expected="the same file as when the scene was read",
             found="other contents",
-            remedy="Leave a scene alone while it is worked on; then start again.",
+            remedy="Do not change a scene while it is in use; start again.",
         )
         return data
 
     def digest(self, root: Path) -> str:
-        """SHA-256 over names in ``root`` and contents of all files that were read."""
+        """Return the SHA-256 over names in ``root`` and contents of all files that were read."""
         lines = sorted(
             f"{canonical(path.relative_to(root).as_posix())} {digest}\n"
             for path, digest in self.digests.items()
         )
         return hashlib.sha256("".join(lines).encode()).hexdigest()
 
-    def read_if_there(self, path: Path, otherwise: T) -> bytes | T:
-        """The bytes of a JSON file; ``otherwise`` if there is no such file."""
-        there = os.path.lexists(path)  # a link to nowhere is no absence
-        return self.read(path, LARGEST_RECORD) if there else otherwise
+    def read_if_there(self, path: Path, default: T) -> bytes | T:
+        """Read a JSON file; return ``default`` if it is missing. A dangling link is not missing."""
+        return self.read(path, LARGEST_RECORD) if os.path.lexists(path) else default
 
 
 @dataclass(frozen=True, eq=False)
 class ViewData:
-    """The pixels of one view, before the full scale of the whole capture is known.
+    """Pixels of a view before the full scale of the whole capture is known.
 
     Attributes:
-        name, codes, invalid, mask, materials, ground_truth, exposures: as in ``View``, with arrays instead of tensors.
-        material_numbers: that the picture of materials has as stored.
-        size: width and height of the pictures as stored.
+        name, codes, invalid, mask, materials, ground_truth, exposures: attributes of ``View``, as arrays.
+        material_numbers: numbers in the stored picture of materials.
+        size: width and height of the stored pictures.
         peak: largest stored value over angles, channels and the pixels of a box, [H, W].
-        black: whether some pixel of the box is 0 in all angles and channels, [H, W].
+        black: mask of boxes with a pixel that is 0 in all angles and channels, [H, W].
         histogram: ``checks.top_histogram`` of the stored values.
-        digests: SHA-256 of every file read.
-        samples: at the points that the view observes; None where they are not compared.
+        digests: SHA-256 of every file.
+        samples: samples at observed points for the comparison of exposures; None without it.
     """
 
     name: str
@@ -246,7 +246,7 @@ class ViewData:
     samples: PointSamples | None = None
 
     def saturated(self, scale: int | None) -> NDArray[np.bool_]:
-        """``View.saturated``, given the stored value at which the capture saturates (None: it does not)."""
+        """Return ``View.saturated``, given the stored value of saturation (None: no saturation)."""
         return self.black if scale is None else np.asarray(self.black | (self.peak >= scale))
 
     def view(
@@ -257,12 +257,14 @@ class ViewData:
         files: ViewFiles | None = None,
         gains: tuple[float, float, float] = EVEN,
     ) -> View:
-        """The view with its camera and its saturated pixels.
+        """Create the view with its camera and its saturated pixels.
 
         Args:
-            camera: camera of the view. scale: as for ``saturated``. mount: where the polarizer was.
-            files: load codes and ground truth when they are read; None: those that are here stay in memory.
-            gains: as in ``View``.
+            camera: camera of the view.
+            scale: stored value of saturation, see ``saturated``.
+            mount: place of the polarizer.
+            files: loaders of codes and ground truth; default: they stay in memory.
+            gains: attribute of ``View``.
         """
         invalid = torch.from_numpy(self.invalid)
         saturated = torch.from_numpy(self.saturated(scale))
@@ -282,13 +284,15 @@ class ViewData:
 
 
 class ViewFiles:
-    """Loaders of what the files of views hold.
+    """Loaders of the files of views.
 
     Args:
-        layout: the files. factor, transfer: as for ``read_view``. digests: SHA-256 of the files as they were read.
+        layout: files of the capture.
+        factor, transfer: arguments of ``read_view``.
+        digests: SHA-256 of the files when the scene was read.
     """
 
-    def __init__(self, layout: Layout, factor: int, transfer: str, digests: Mapping[Path, str]) -> None:
+    def __init__(self, layout: CaptureFiles, factor: int, transfer: str, digests: Mapping[Path, str]) -> None:
         self._layout = layout
         self._factor = factor
         self._transfer = transfer
@@ -297,11 +301,11 @@ class ViewFiles:
         self._truths = Latest()
 
     def codes(self, name: str) -> Loader[Tensor]:
-        """Loader of ``View.codes``, which raises an error if a file was changed or deleted."""
+        """Return a loader of ``View.codes``, which raises an error if a file was changed or deleted."""
         return Loader(functools.partial(self._read_codes, name), self._pictures)
 
     def ground_truth(self, name: str, size: tuple[int, int]) -> Loader[GroundTruth | None] | None:
-        """Loader of ``View.ground_truth``, or None if the scene has no ground truth of this view.
+        """Return a loader of ``View.ground_truth``, or None without ground truth of this view.
 
         The loader raises an error if the file was changed or deleted after the scene was opened.
 
@@ -322,26 +326,29 @@ class ViewFiles:
 
 
 def _compact(mask: Tensor) -> Tensor:
-    """The mask, without memory where nothing is set."""
+    """Return the mask in a form that takes no memory if it is empty."""
     return mask if bool(mask.any()) else torch.zeros((), dtype=torch.bool).expand(mask.shape)
 
 
-_BESIDE: dict[str, Callable[[Path, bytes], NDArray[Any]]] = {
+_DECODERS: dict[str, Callable[[Path, bytes], NDArray[Any]]] = {
     "invalid": functools.partial(decode_mask, any_value=True),
     "mask": functools.partial(decode_mask, any_value=False),
     "materials": decode_materials,
 }
-"""Decoders of the pictures beside those of a view, by their kind."""
+"""Decoders of a view's optional pictures by kind."""
 
 
 def read_view(
-    layout: Layout, name: str, *, factor: int, transfer: str, points: ComparedPoints | None = None
+    layout: CaptureFiles, name: str, *, factor: int, transfer: str, points: ComparedPoints | None = None
 ) -> ViewData:
-    """Read all files of one view, averaged over boxes of ``factor`` x ``factor`` pixels.
+    """Read all files of a view, averaged over boxes of ``factor`` x ``factor`` pixels.
 
     Args:
-        layout: the files. name: of the view. transfer: how the pictures are encoded.
-        points: what its pictures are sampled at, in full size.
+        layout: files of the capture.
+        name: name of the view.
+        factor: side of the boxes.
+        transfer: encoding of the pictures.
+        points: points at which the full-size pictures are sampled.
 
     Raises:
         PolarguideError: a file is damaged, or the sizes of the files differ.
@@ -350,8 +357,8 @@ def read_view(
     raw = _read_pictures(files, layout.files(name))
     height, width = raw[0].shape[:2]
     require_factor(factor, height, width)
-    beside = {
-        kind: _read_beside(files, folder, name, (height, width), _BESIDE[kind])
+    optional = {
+        kind: _read_optional(files, folder, name, (height, width), _DECODERS[kind])
         for kind, folder in (
             ("invalid", layout.invalid),
             ("mask", layout.masks),
@@ -368,13 +375,13 @@ def read_view(
         layout.exposures(name),
         factor=factor,
         transfer=transfer,
-        **beside,
+        **optional,
         ground_truth=ground_truth,
         digests=files.digests,
     )
     if points is None:
         return data
-    return replace(data, samples=points.samples(name, raw, beside["invalid"], transfer))
+    return replace(data, samples=points.samples(name, raw, optional["invalid"], transfer))
 
 
 def require_factor(factor: int, height: int, width: int) -> None:
@@ -405,12 +412,15 @@ def view_data(
     ground_truth: GroundTruth | None = None,
     digests: Mapping[Path, str] | None = None,
 ) -> ViewData:
-    """A view of its stored pictures [H, W, 3], averaged over boxes of ``factor`` x ``factor`` pixels.
+    """Average the stored pictures [H, W, 3] of a view over boxes of ``factor`` x ``factor`` pixels.
 
     Args:
-        name, exposures, ground_truth, digests: as in ``ViewData``; the ground truth is averaged already.
-        raw: uint8 or uint16, all of one shape and type. transfer: how they are encoded.
-        invalid, mask, materials: [H, W] of the stored pictures.
+        name, exposures, digests: attributes of ``ViewData``.
+        raw: stored pictures, uint8 or uint16, of one shape and type.
+        factor: side of the boxes.
+        transfer: encoding of the pictures.
+        invalid, mask, materials: full-size masks and labels, [H, W].
+        ground_truth: ground truth, already averaged.
     """
     height, width = raw[0].shape[:2]
     peak = functools.reduce(np.maximum, [pixels[..., channel] for pixels in raw for channel in range(3)])
@@ -433,11 +443,11 @@ def view_data(
     )
 
 
-def check_materials(layout: Layout, views: Iterable[ViewData], indices: Mapping[int, float]) -> None:
-    """Refuse numbers of materials that nobody explains.
+def check_materials(layout: CaptureFiles, views: Iterable[ViewData], indices: Mapping[int, float]) -> None:
+    """Refuse numbers of materials without a definition.
 
     Raises:
-        PolarguideError: a picture has one that ``indices`` have not.
+        PolarguideError: a picture has a number that ``indices`` lacks.
     """
     for view in views:
         if unknown := view.material_numbers - {0, 1, 2, *indices}:
@@ -450,12 +460,12 @@ def check_materials(layout: Layout, views: Iterable[ViewData], indices: Mapping[
 
 
 def _codes(raw: Sequence[NDArray[Any]], transfer: str, factor: int) -> NDArray[np.uint16]:
-    """Linear codes of stored pictures, averaged over boxes."""
+    """Return linear codes of stored pictures, averaged over boxes."""
     return np.stack([boxes.mean_codes(linear_codes(pixels, transfer), factor) for pixels in raw])
 
 
 def _read_pictures(files: Files, paths: list[Path]) -> list[NDArray[Any]]:
-    """The stored pictures of a view, [H, W, 3] each, of one size and one depth."""
+    """Read the pictures of a view, [H, W, 3] each, of one size and one depth."""
     pictures: list[NDArray[Any]] = []
     for path in paths:
         data = files.picture(path)
@@ -469,11 +479,13 @@ def _read_pictures(files: Files, paths: list[Path]) -> list[NDArray[Any]]:
 
 
 def require_size(path: Path, data: bytes, size: Sequence[int], *, like: Path | None = None) -> None:
-    """Reject a picture whose header states another size, before memory is allocated to decode it.
+    """Refuse a picture whose header states another size, before memory is allocated to decode it.
 
     Args:
-        path, data: the file and its bytes.
-        size: expected height and width. like: the file that has this size, for the message.
+        path: path of the file.
+        data: content of the file.
+        size: expected height and width.
+        like: file of this size for the message.
 
     Raises:
         PolarguideError: the header states another size.
@@ -485,7 +497,7 @@ def require_size(path: Path, data: bytes, size: Sequence[int], *, like: Path | N
             path,
             expected=f"{alike}, {size[1]}x{size[0]}",
             found=f"{stated[0]}x{stated[1]}",
-            remedy="Make it anew for these pictures."
+            remedy="Create it again for these pictures."
             if like is None
             else "Export all pictures of a view with the same settings.",
         )
@@ -509,14 +521,14 @@ def require_alike(path: Path, picture: NDArray[Any], first_path: Path, first: ND
         )
 
 
-def _read_beside(
+def _read_optional(
     files: Files,
     folder: Mapping[str, Path],
     name: str,
     size: Sequence[int],
     decode: Callable[[Path, bytes], NDArray[Any]],
 ) -> NDArray[Any] | None:
-    """The picture of a view in a folder beside its pictures, which has their size; None where there is none."""
+    """Read an optional picture of a view, which must have the size of its pictures; None if it is missing."""
     if name not in folder:
         return None
     path = folder[name]
@@ -527,15 +539,15 @@ def _read_beside(
 
 @dataclass(frozen=True, eq=False)
 class StoredViews:
-    """The views of a capture as read, with a pose or without.
+    """Views of a capture as read, with or without a pose.
 
     Attributes:
-        data: the views, sorted by name.
-        cameras: cameras of each view at the size of its averaged pictures; None where the model has no pose.
+        data: views, sorted by name.
+        cameras: camera of each view at the size of its averaged pictures; None without a pose.
         measures: ``checks.measure`` of each view.
-        largest_value: the largest value that the files can store, 255 or 65535.
-        full_scale: the stored value at which the capture saturates; None if nothing is saturated.
-        exposures: those of each view by points in common; None where they are not compared.
+        largest_value: largest value that the files can store, 255 or 65535.
+        full_scale: stored value of saturation; None if no pixel is saturated.
+        exposures: exposures of the views at common points; None if they are not compared.
     """
 
     data: tuple[ViewData, ...]
@@ -552,7 +564,7 @@ class StoredViews:
         cameras: Sequence[Camera | None],
         points: ComparedPoints | None = None,
     ) -> StoredViews:
-        """Measure views, find where they saturate, and compare their exposures at points.
+        """Measure views, detect saturation, and compare exposures at points.
 
         Raises:
             PolarguideError: the views differ in bit depth.
@@ -576,7 +588,7 @@ class StoredViews:
         return cls(tuple(data), tuple(cameras), tuple(measures), largest_value, scale, exposures)
 
     def picture_warnings(self, transfer: str) -> list[str]:
-        """Warnings about the exposure, encoding and order of the pictures."""
+        """Return warnings about the exposure, encoding and order of the pictures."""
         names = [item.name for item in self.data]
         scale = self.full_scale
         blown = [0.0 if scale is None else float((item.peak >= scale).mean()) for item in self.data]

@@ -111,20 +111,20 @@ VERBS = {
         "A table of many shots for inspection lines: S0, DoLP and AoLP by region, limits, a golden part.",
     ),
     "compare": Verb(
-        "polarguide_bench.verbs.compare",
+        "polarguide_bench.verbs",
         "compare_recipes",
-        "Train and score several recipes on several scenes, and set tables and a report of them.",
+        "Train and score several recipes on several scenes, and write tables and a report.",
     ),
     "ablate": Verb(
-        "polarguide_bench.verbs.compare",
+        "polarguide_bench.verbs",
         "ablate_recipe",
-        "Compare a recipe with its ablations: the same with one thing changed, each.",
+        "Compare a recipe with its ablations. Each ablation changes one thing.",
     ),
     "batch": Verb(
-        "polarguide_bench.verbs.batch",
+        "polarguide_bench.verbs",
         "batch",
         "Prepare, inspect, train, score, share and export every capture of a collection, with one "
-        "page over all.",
+        "overview page.",
     ),
     "synth": Verb(
         "polarguide_synth.verbs",
@@ -133,15 +133,15 @@ VERBS = {
         "...) or a scene file.",
     ),
     "bench": Verb(
-        "polarguide_bench.verbs.compare",
+        "polarguide_bench.verbs",
         "bench",
         "Render the scenes of the benchmark that are missing, then train and score every recipe on "
         "each scene.",
     ),
     "tables": Verb(
-        "polarguide_bench.verbs.compare",
+        "polarguide_bench.verbs",
         "tables",
-        "Join the records of comparisons that were run apart, and set their tables anew.",
+        "Join the records of several comparisons, and write their tables.",
     ),
     "doctor": Verb(
         "polarguide.cli.doctor",
@@ -186,10 +186,8 @@ def run(arguments: Sequence[str]) -> int:
     """Run a command line and return the exit status: 0 done, 1 stopped, 2 wrong input, or the status of the verb."""
     verb = arguments[0] if arguments and arguments[0] in VERBS else None
     before = interrupts()
-    for stream in (
-        sys.stdout,
-        sys.stderr,
-    ):  # names of files may have bytes that are not text, or that the encoding lacks
+    for stream in (sys.stdout, sys.stderr):
+        # File names may contain bytes that are not text or that the encoding lacks.
         if isinstance(stream, io.TextIOWrapper):
             # In the C locale Python decodes names of files as ASCII, although terminals show UTF-8.
             stream.reconfigure(

@@ -66,23 +66,21 @@ def inspect_capture(
     """Check a capture and its polarizer angles, and write a page and a JSON file.
 
     Each check results in ok, warning, wrong or n/a, and names a remedy. Camera poses are needed only to check the
-    order,
-    the direction of rotation and the zero of the angles. docs/how-to/inspect.md describes the checks and their
-    limits.
+    order, the direction of rotation and the zero of the angles. docs/how-to/inspect.md describes the checks
+    and their limits.
 
     Args:
         scene: Scene folder.
         out: Folder for the page; default: SCENE-inspection next to the scene.
         fix: New folder for a corrected copy of the scene, written if the order, the direction or the zero is wrong
-            and
-            the correction is certain.
+            and the correction is certain.
     """
     if fix is not None and settings.calibration is not None:
         raise PolarguideError(
             "--fix",
-            expected="no --calibration beside it: the copy would be without it",
-            found="both",
-            remedy="Prepare the mosaics anew with --calibration, and fix that scene.",
+            expected="no --calibration, which the corrected copy would lack",
+            found="both options",
+            remedy="Prepare the mosaics again with --calibration, and fix that scene.",
         )
     set_threads(compute.threads)
     reporter = ConsoleReporter()
@@ -174,23 +172,19 @@ def present_folder(
     """Set how a scene or a run is shown and exported: color, up, scale, crop box, credit. Data and scores stay.
 
     The settings are in presentation.json in the folder. A scene's settings apply to all its runs; a run's own
-    settings take
-    precedence. Omitted options keep their values, "none" removes a value, and without options the settings are
-    printed.
-    `polarguide view RUN` sets the same with the mouse. VIEW,X,Y is a pixel of a photograph, from its top left corner.
+    settings take precedence. Omitted options keep their values, "none" removes a value, and without options
+    the settings are printed. `polarguide view RUN` sets the same with the mouse. VIEW,X,Y is a pixel of a
+    photograph, from its top left corner.
 
     Args:
         folder: Folder of a scene or a run.
         white_balance: gray (the photographs' mean becomes gray), gains such as 1.9,1,1.6, or VIEW,X,Y of something
-            white
-            or gray.
+            white or gray.
         chart: VIEW,X,Y,X,Y,X,Y,X,Y: the centers of the corner patches of a 24-patch color chart in a photograph,
-            around
-            it; or the folder of another scene with a chart. It replaces a white balance.
+            around it; or the folder of another scene with a chart. It replaces a white balance.
         exposure: Exposure compensation in stops, such as 0.5.
         up_axis: An axis such as z or --up-axis=-y, three numbers, or VIEW,X,Y of a level surface. Default: the up
-            axis of
-            the cameras.
+            axis of the cameras.
         points: Two points of known distance: X,Y,Z in the scene, VIEW,X,Y on a surface, or VIEW for a camera's
             position.
         distance: Distance of the two points, such as 85mm.

@@ -60,8 +60,7 @@ def diagnosis() -> dict[str, Any]:
         ``polarguide`` and ``python``: versions. ``packages``: versions by name, None for a package that is not
         installed. ``kernels`` and ``torch``: their properties, or ``error`` alone if they cannot be loaded.
         ``extras``: optional packages. ``machine``: processor, memory and disk. ``problems``: faults that make
-        commands
-        fail. ``notes``: other faults.
+        commands fail. ``notes``: other faults.
     """
     packages = {
         each.name: _version(each.name)
@@ -159,8 +158,9 @@ def _notes(torch: dict[str, Any], extras: dict[str, Any]) -> list[str]:
 
 
 def _useless_cuda(version: str) -> str:
-    """Return a note about PyTorch for CUDA on a machine without a GPU, with its size and the commands that replace
-    it.
+    """Return a note about PyTorch for CUDA on a machine without a GPU.
+
+    The note states the size of the libraries and the commands that replace them.
     """
     libraries = {
         name: sum((file.size or 0) for file in each.files or ())
@@ -169,8 +169,8 @@ def _useless_cuda(version: str) -> str:
     }
     remove = shlex.join(["pip", "uninstall", "-y", "torch", *sorted(libraries)])
     return (
-        f"PyTorch is built for CUDA {version}, and there is no GPU here: its libraries take "
-        f"{sum(libraries.values()) / 1e9:.1f} GB beside PyTorch's own. The build for processors is enough: {remove}; "
+        f"PyTorch is built for CUDA {version}, but there is no GPU: the CUDA libraries take "
+        f"{sum(libraries.values()) / 1e9:.1f} GB. The build for processors is sufficient: {remove}; "
         "pip install uv; uv pip install --torch-backend=cpu torch"
     )
 

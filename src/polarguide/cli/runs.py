@@ -56,10 +56,9 @@ def train_scene(
             model in sparse/0.
         out: Run folder to write (configuration, checkpoint, log, PLY).
         recipe: Method: polarguide-stokes (renders the measured polarization as well), polarguide (PolarGuide-GSDR's
-            stages
-            with repaired physics), polarguide-paper; 3dgs, 3dgs-dr and ref-gs, which ignore polarization; an ablation
-            of
-            one, such as polarguide:without-normals; or a recipe of an installed package.
+            stages with repaired physics), polarguide-paper; 3dgs, 3dgs-dr and ref-gs, which ignore
+            polarization; an ablation of one, such as polarguide:without-normals; or a recipe of an installed
+            package.
         resume: Continue the run in --out.
     """
     with StopSignals() as should_stop:
@@ -201,8 +200,7 @@ def render_run(
         size: Size of the pictures along the path, such as 1920x1080, for all layers together.
         video: MP4 file of the path, layers side by side with their names; default: PNG files.
         format: Format of the layers of views: png as a display shows them, or exr and npy with the linear numbers,
-            whose
-            units layers.json states. The contact sheet is PNG.
+            whose units layers.json states. The contact sheet is PNG.
         transparent: Write PNG files of views with a transparent background, without a dark rim around the subject.
         environment: Panorama of linear radiance (.hdr, .exr) that replaces the learned environment.
         rotate_environment: Rotation of the environment in degrees, counter-clockwise seen from above.
@@ -305,7 +303,7 @@ def demo(
 
 def _first_picture(out: Path) -> Path:
     """Write a held-out view with its layers, larger than its photograph, and return the path."""
-    layers = importlib.import_module("polarguide.visualization.layers")
+    layers = importlib.import_module("polarguide.visualization.figures")
     figures = importlib.import_module("polarguide.visualization.figures")
     run = polarguide.open_run(out)
     camera = run.scene.view(FIRST_VIEW).camera
@@ -384,15 +382,13 @@ def export_run(
     model: Annotated[ModelOptions, tyro.conf.arg(name="")] = ModelOptions(),
     machine: ThreadOptions = ThreadOptions(),
 ) -> None:
-    """Write a run as the files of other programs.
+    """Export a run to the file formats of other programs.
 
-    ply, spz, sog, splat-glb and splat-usdz are ordinary splats, with reflections baked as far as harmonics represent
-    them;
-    mesh (GLB and PLY) is fused from rendered depth, with diffuse colors and learned normals; glb (or obj, usdz) is a
-    textured model for Blender, game engines and viewers, whose base color has neither highlights nor shading; stl is
-    its closed surface for 3D printing; points are opaque Gaussians with normals; environment is the learned light as
-    a
-    panorama (EXR, HDR and PNG); cameras are a COLMAP model and transforms.json; all is a package of most of these.
+    Splats (ply, spz, sog, splat-glb, splat-usdz) have reflections baked into harmonics. The mesh (GLB and PLY) is fused
+    from rendered depth and has diffuse colors and learned normals. The textured model (glb, obj, usdz) is for Blender,
+    game engines and viewers. Its base color has no highlights and no shading. Its closed surface (stl) is for 3D
+    printing. The points are opaque Gaussians with normals. The environment is the learned light as a panorama (EXR, HDR
+    and PNG). The cameras are a COLMAP model and transforms.json. The choice all is a package of most of these.
 
     Args:
         run: Run folder.
@@ -401,8 +397,7 @@ def export_run(
         resolution: Voxels of the mesh along its longest side.
         spz_version: Version of the SPZ file; programs support only one of the two.
         fields: Fields of ply: release has those of every 3DGS file; all adds polarguide.ply, with linear colors,
-            strength,
-            roughness and more, for programs that read fields by name.
+            strength, roughness and more, for programs that read fields by name.
         axes: upright (+y in GLB and USD, -y elsewhere), or the axes of the scene, except in GLB and USD.
     """
     for package in EXPORT_PACKAGES.get(format, ()):

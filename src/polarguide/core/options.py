@@ -49,7 +49,7 @@ EXPORT_PACKAGES: dict[str, tuple[str, ...]] = {
     "all": ("gaussforge", "skimage", "xatlas", "fast_simplification"),
     "usdz": ("pxr", "skimage", "xatlas", "fast_simplification"),
     "splat-usdz": ("pxr",),
-    "stl": ("skimage", "fast_simplification"),
+    "stl": ("skimage", "trimesh", "fast_simplification"),
     "environment": ("OpenEXR",),
 }
 """Packages that export formats need. They are checked before a run is loaded."""

@@ -1,7 +1,7 @@
-"""A pinhole camera with a pose: the one camera type of the project.
+"""Pinhole cameras with a pose.
 
-OpenCV axes (x right, y down, z forward), world-to-camera pose ``x_cam = R x_world + t``, and the center of the
-top-left pixel at (0.5, 0.5), as in COLMAP.
+Axes are those of OpenCV (x right, y down, z forward), the pose is world-to-camera, ``x_cam = R x_world + t``, and the
+center of the top-left pixel is at (0.5, 0.5), as in COLMAP.
 """
 
 from __future__ import annotations
@@ -20,22 +20,23 @@ from polarguide.core.errors import PolarguideError
 from polarguide.geometry.vectors import unit, unit_array
 
 FARTHEST = 1e9
-"""The largest coordinate and focal length; single precision tells nothing apart beyond."""
+"""Upper bound of coordinates and focal lengths, for a sufficient resolution in single precision."""
 FARTHEST_CENTER = 1e4
-"""Of the principal point from the picture's corner, in sides of the picture, which may be a crop of a larger one."""
+"""Maximum distance of the principal point from the picture's corner, in sides of the picture; crops have large ones."""
 SHORTEST_FOCAL = 1e-4
-"""In sides of the picture."""
+"""Minimum focal length, in sides of the picture."""
 MOST_STRETCH = 100.0
-"""Of one focal length over the other; anamorphic lenses have 2."""
+"""Maximum ratio of the two focal lengths; anamorphic lenses have 2."""
 LENS = (
     f"positive focal lengths, at most {MOST_STRETCH:g} times one another, and a principal point, at most "
     f"{FARTHEST_CENTER:g} sides of the picture away"
 )
+"""Description of a valid lens, for messages."""
 
 
 def can_be_lens(size: ArrayLike, focal: ArrayLike, center: ArrayLike) -> bool:
-    """Whether a lens can have these numbers in pixels, also in single precision; false for NaN."""
-    side = max(float(np.max(size)), 1.0)  # pictures without pixels are refused elsewhere
+    """Return True if a lens can have these numbers in pixels, also in single precision; False for NaN."""
+    side = max(float(np.max(size)), 1.0)  # other checks refuse pictures without pixels
     lengths = np.asarray(focal, np.float64)
     places = np.abs(np.asarray(center, np.float64))
     sound = (lengths <= FARTHEST).all() and (places <= min(FARTHEST, FARTHEST_CENTER * side)).all()
@@ -51,7 +52,7 @@ def _pixel_rays(
     dtype: torch.dtype,
     device: torch.device,
 ) -> Tensor:
-    """Rays of an internal calibration, which views share and every rendering asks for."""
+    """Return the rays of intrinsics. They are cached, because views share them and each rendering reads them."""
     x, y = (
         (torch.arange(n, dtype=dtype, device=device) + 0.5 - c) / f
         for n, f, c in zip(size, focal, center, strict=True)
@@ -61,10 +62,11 @@ def _pixel_rays(
 
 
 class Pose(NamedTuple):
-    """A pose on one device, in one dtype.
+    """Pose on one device, in one dtype.
 
     Attributes:
-        rotation: world-to-camera, [3, 3]. translation: world-to-camera, [3]. center: of the camera in the world, [3].
+        rotation: world-to-camera, [3, 3]. translation: world-to-camera, [3].
+        center: camera center in the world, [3].
     """
 
     rotation: Tensor
@@ -74,7 +76,7 @@ class Pose(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """A pinhole camera.
+    """Pinhole camera.
 
     Attributes:
         width, height: picture size in pixels.
@@ -96,7 +98,7 @@ class Camera:
     def from_matrices(
         cls, intrinsics: ArrayLike | Tensor, world_to_camera: ArrayLike | Tensor, width: int, height: int
     ) -> Camera:
-        """A camera of two matrices, as OpenCV and COLMAP have them.
+        """Create a camera from two matrices as used by OpenCV and COLMAP.
 
         Args:
             intrinsics: [3, 3], focal lengths and principal point in pixels, without skew.
@@ -104,7 +106,7 @@ class Camera:
             width, height: picture size in pixels.
 
         Raises:
-            PolarguideError: the matrices have another shape, or are no camera's.
+            PolarguideError: the matrices have another shape or do not describe a camera.
         """
         inner, outer = (
             torch.as_tensor(m).cpu().numpy().astype(np.float64) for m in (intrinsics, world_to_camera)
@@ -133,19 +135,19 @@ class Camera:
 
     @property
     def intrinsics(self) -> Tensor:
-        """Focal lengths and principal point as a matrix, [3, 3] float64."""
+        """Matrix of focal lengths and principal point, [3, 3] float64."""
         matrix = [[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]]
         return torch.tensor(matrix, dtype=torch.float64)
 
     @property
     def world_to_camera(self) -> Tensor:
-        """The pose as a matrix, [4, 4] float64."""
+        """Matrix of the pose, [4, 4] float64."""
         matrix = torch.eye(4, dtype=torch.float64)
         matrix[:3, :3], matrix[:3, 3] = self.rotation, self.translation
         return matrix
 
     def pose(self, dtype: torch.dtype, device: torch.device) -> Pose:
-        """The pose on a device, not to be written to. It is kept, so that a second rendering copies nothing there."""
+        """Return the pose on a device. It is cached, so callers must not write to it."""
         poses: dict[tuple[torch.dtype, torch.device], Pose] = self.__dict__.setdefault("_poses", {})
         key = (dtype, device)
         if key not in poses:
@@ -153,14 +155,14 @@ class Camera:
         return poses[key]
 
     def rays(self, *, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu") -> Tensor:
-        """Unit rays through the pixel centers in camera axes, [height, width, 3]; not to be written to."""
+        """Return unit rays through the pixel centers in camera axes, [height, width, 3]; callers must not edit them."""
         size = (self.width, self.height)
         focal = (self.fx, self.fy)
         center = (self.cx, self.cy)
         return _pixel_rays(size, focal, center, dtype, torch.device(device))
 
     def world_rays(self, *, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu") -> Tensor:
-        """Unit rays through the pixel centers in world axes, [height, width, 3]."""
+        """Return unit rays through the pixel centers in world axes, [height, width, 3]."""
         return self.rays(dtype=dtype, device=device) @ self.pose(dtype, torch.device(device)).rotation
 
     def to_world(self, vectors: Tensor) -> Tensor:
@@ -172,12 +174,12 @@ class Camera:
         return vectors @ self.pose(vectors.dtype, vectors.device).rotation.T
 
     def scaled(self, factor: float, width: int, height: int) -> Camera:
-        """The camera of the same view with ``factor`` times as many pixels each way, in a picture of this size."""
+        """Return the camera of the same view with lengths in pixels multiplied by ``factor``, for a picture size."""
         inner = {name: factor * getattr(self, name) for name in ("fx", "fy", "cx", "cy")}
         return replace(self, width=width, height=height, **inner)
 
     def extended(self, width: int, height: int) -> Camera:
-        """The camera of a picture of another aspect ratio that holds this view as large as possible, in its middle."""
+        """Return the camera of another picture size that shows this view centered and as large as possible."""
         factor = min(width / self.width, height / self.height)
         scaled = self.scaled(factor, width, height)
         left = 0.5 * (width - factor * self.width)
@@ -185,7 +187,7 @@ class Camera:
         return replace(scaled, cx=scaled.cx + left, cy=scaled.cy + top)
 
     def downscaled(self, factor: int) -> Camera:
-        """The camera of the same view averaged over ``factor`` x ``factor`` pixel boxes (remainders are cut)."""
+        """Return the camera of the same view averaged over ``factor`` x ``factor`` pixels; remainders are cut off."""
         inner = {name: getattr(self, name) / factor for name in ("fx", "fy", "cx", "cy")}
         return replace(self, width=self.width // factor, height=self.height // factor, **inner)
 
@@ -195,16 +197,20 @@ def _no_matrices(expected: str, found: str) -> PolarguideError:
         "camera",
         expected=expected,
         found=found,
-        remedy="Correct the matrices; a pose that is camera to world has to be inverted.",
+        remedy="Correct the matrices. Invert a pose that is camera-to-world.",
     )
 
 
 def seen_at(offsets: Tensor, camera: Camera) -> tuple[tuple[Tensor, Tensor], Tensor, Tensor]:
-    """Where a camera sees points: the nearest pixel (row, column), the depth, and whether it lies in the picture.
+    """Project points.
 
     Args:
         offsets: [N, 3] from the camera's center to the points, world axes.
         camera: the view.
+
+    Returns:
+        The nearest pixel in the picture (row, column), each [N] int64; the depth [N]; and [N] bool, True if the point
+        lies in the picture.
     """
     x, y, z = camera.to_camera(offsets).unbind(-1)
     safe = z.clamp(min=1e-6)
@@ -215,12 +221,12 @@ def seen_at(offsets: Tensor, camera: Camera) -> tuple[tuple[Tensor, Tensor], Ten
 
 
 def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike) -> tuple[Tensor, Tensor]:
-    """The pose of a camera that looks at a point.
+    """Return the pose of a camera that looks at a point.
 
     Args:
         eye: [3] center of the camera in the world.
         target: [3] point on the optical axis, not ``eye``.
-        up: [3] direction that is upward in the picture, not parallel to the optical axis.
+        up: [3] upward direction in the picture, not parallel to the optical axis.
 
     Returns:
         World-to-camera rotation [3, 3] and translation [3], float64.
@@ -233,6 +239,6 @@ def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike) -> tuple[Tensor, T
 
 
 def quaternion(rotation: ArrayLike) -> tuple[float, float, float, float]:
-    """Unit quaternion (w, x, y, z) of a rotation matrix [3, 3]; its sign is either."""
+    """Return a unit quaternion (w, x, y, z) of a rotation matrix [3, 3]; its sign is arbitrary."""
     x, y, z, w = Rotation.from_matrix(np.asarray(rotation)).as_quat().tolist()
     return w, x, y, z

@@ -1,6 +1,6 @@
-"""The polarizer before the camera: its four angles, and Malus's law. For NumPy arrays and torch tensors alike.
+"""Linear polarizer of a camera: its four angles and Malus's law, for NumPy arrays and PyTorch tensors.
 
-Angles count counter-clockwise as displayed, from the image's horizontal.
+Angles are counter-clockwise as displayed, from the image's horizontal.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ ANGLES = (0, 45, 90, 135)
 
 
 def malus(stokes: Any, angle: Any) -> Any:
-    """Intensity behind an ideal polarizer: Malus's law, ``(S0 + S1 cos 2a + S2 sin 2a) / 2``.
+    """Return the intensity behind an ideal polarizer by Malus's law, ``(S0 + S1 cos 2a + S2 sin 2a) / 2``.
 
     Args:
-        stokes: S0, S1 and S2, each [...]: an array or tensor [3, ...], or three.
-        angle: angle of the polarizer, radians: a number, or an array or tensor that broadcasts against [...].
+        stokes: S0, S1 and S2, each [...]: an array or tensor [3, ...], or a sequence.
+        angle: angle of the polarizer in radians: a number, or an array or tensor that broadcasts against [...].
 
     Returns:
         [...], of the type of ``stokes``.
@@ -35,28 +35,28 @@ def malus(stokes: Any, angle: Any) -> Any:
 
 
 def stokes_of_four(intensities: Any) -> tuple[Any, Any, Any]:
-    """S0, S1 and S2 of the intensities at ``ANGLES``, the least-squares solution of Malus's law.
+    """Solve Malus's law for S0, S1 and S2 by least squares, from the intensities at ``ANGLES``.
 
     ``S0 = (I0 + I45 + I90 + I135) / 2``, ``S1 = I0 - I90``, ``S2 = I45 - I135``.
 
     Args:
-        intensities: four, each [...]: an array or tensor [4, ...], or four.
+        intensities: four intensities, each [...]: an array or tensor [4, ...], or a sequence.
 
     Returns:
-        Three of [...].
+        S0, S1 and S2, each [...].
     """
     i0, i45, i90, i135 = intensities
     return (i0 + i45 + i90 + i135) / 2, i0 - i90, i45 - i135
 
 
 def four_intensities(stokes: Any) -> tuple[Any, Any, Any, Any]:
-    """Malus's law at ``ANGLES``, where sine and cosine are 0 and 1: the inverse of ``stokes_of_four``.
+    """Return the intensities at ``ANGLES`` by Malus's law: the inverse of ``stokes_of_four``.
 
     Args:
         stokes: S0, S1 and S2, each [...].
 
     Returns:
-        Four of [...].
+        Four intensities, each [...].
     """
     s0, s1, s2 = stokes
     return (s0 + s1) / 2, (s0 + s2) / 2, (s0 - s1) / 2, (s0 - s2) / 2

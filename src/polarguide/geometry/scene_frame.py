@@ -1,32 +1,33 @@
-"""Where the cameras of a capture stand: what they look at, which way is up, and how far away they are."""
+"""Frame of a scene, estimated from its cameras: center, upward direction and distance."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from polarguide.geometry.camera import Camera
 from polarguide.geometry.vectors import unit
 
-# Optical axes that are nearly parallel do not say where they meet: the cameras' own distance from each other does then.
 _LEAST_SPREAD = 1e-4
-# The pictures' rows say what is level if they fan out by so much (variance of unit vectors) and roll by less than so.
+"""Smallest eigenvalue of the least-squares system for which optical axes count as intersecting."""
 _LEAST_FAN = 0.03
+"""Minimum variance of the pictures' rows (unit vectors) within a level plane."""
 _MOST_ROLL = 0.2
+"""Maximum variance of the rows out of that plane, as a share of the variance within it."""
 
 
 @dataclass(frozen=True, eq=False)
 class SceneFrame:
-    """A frame for moving cameras about a scene.
+    """Frame in which cameras move around a scene.
 
     Attributes:
-        center: [3] float64, what the cameras look at.
+        center: [3] float64, point at which the cameras look.
         up: [3] float64, unit.
-        distance: distance of the cameras from the center, their median; world units, positive.
+        distance: median distance of the cameras from the center; world units, positive.
     """
 
     center: Tensor
@@ -34,17 +35,14 @@ class SceneFrame:
     distance: float
 
     def turn(self, degrees: float) -> Tensor:
-        """Rotation [3, 3] float64 about ``up``, counter-clockwise as seen from above."""
-        x, y, z = self.up.tolist()
-        cross = torch.tensor([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]], dtype=torch.float64)
-        angle = math.radians(degrees)
-        eye = torch.eye(3, dtype=torch.float64)
-        return eye + math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
+        """Return the rotation [3, 3] float64 about ``up``, counter-clockwise as seen from above."""
+        return torch.from_numpy(Rotation.from_rotvec(degrees * self.up.numpy(), degrees=True).as_matrix())
 
     def panorama_axes(self) -> Tensor:
-        """Axes of an upright panorama, [3, 3] float64: columns are its right, its up, and the back (middle is ahead).
+        """Return the axes of an upright panorama, [3, 3] float64: columns are right, up and back.
 
-        Ahead is the world axis that is most level, the first of equals, made level.
+        The middle of the panorama shows the most level world axis, projected onto the level plane. Ties go to the first
+        axis.
         """
         level = torch.zeros(3, dtype=torch.float64)
         level[int(self.up.abs().round(decimals=6).argmin())] = 1.0
@@ -53,12 +51,12 @@ class SceneFrame:
 
 
 def scene_frame(cameras: Sequence[Camera]) -> SceneFrame:
-    """The frame of some cameras, at least one.
+    """Estimate the frame of one or more cameras.
 
-    The center is the point nearest to all optical axes (least squares). Parallel axes, as of a camera shifted along a
-    line, meet nowhere: then it lies ahead of the cameras' mean by as much as they spread. Up is the direction to which
-    the pictures' rows are most nearly perpendicular (least squares), as people hold cameras level while they look down;
-    where the rows do not tell, it is the mean of the pictures' upward directions.
+    The center is the point nearest to all optical axes (least squares). If the axes are parallel, as for a camera that
+    moves along a line, the center lies ahead of the cameras' mean by the size of their spread. Up is the direction
+    perpendicular to the pictures' rows (least squares), because people hold cameras level. If the rows do not determine
+    it, up is the mean of the pictures' upward directions.
     """
     centers = torch.stack([camera.center for camera in cameras])
     forward = torch.stack([camera.rotation[2] for camera in cameras])
@@ -77,15 +75,15 @@ def scene_frame(cameras: Sequence[Camera]) -> SceneFrame:
 
 
 def _common_up(cameras: Sequence[Camera]) -> Tensor:
-    """Unit [3] float64; see ``scene_frame``."""
+    """Return the unit upward direction [3] float64; see ``scene_frame``."""
     mean = -torch.stack([camera.rotation[1] for camera in cameras]).mean(dim=0)
-    if float(mean.norm()) < 0.05:  # cameras all around, or rolled: no common up
+    if float(mean.norm()) < 0.05:  # no common direction: cameras on all sides, or rolled
         mean = -cameras[0].rotation[1]
     mean = mean / mean.norm()
     rows = torch.stack([camera.rotation[0] for camera in cameras])
     values, axes = torch.linalg.eigh(rows.T @ rows / len(rows))
     axis = axes[:, 0]
-    # The rows have to spread over a plane, with little out of it, and the cameras to be upright rather than on end.
+    # The rows must spread over a plane, and the cameras must be upright rather than on edge.
     is_level = float(values[1]) > _LEAST_FAN and float(values[0]) < _MOST_ROLL * float(values[1])
     if not is_level or abs(float(axis @ mean)) < 0.5:
         return mean

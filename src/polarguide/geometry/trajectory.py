@@ -1,7 +1,7 @@
-"""Camera paths: around a scene, through its photographs' poses, or from a file.
+"""Camera paths: around a scene, through the poses of its photographs, or from a file.
 
-A file is JSON, ``{"cameras": [...], "frames_per_second": 30}``, each camera with ``width``, ``height``, ``fx``, ``fy``,
-``cx``, ``cy``, ``rotation`` (world to camera, 9 numbers row by row) and ``translation`` (3 numbers), in OpenCV's axes.
+A file is JSON, ``{"cameras": [...], "frames_per_second": 30}``. Each camera has ``width``, ``height``, ``fx``, ``fy``,
+``cx``, ``cy``, ``rotation`` (world-to-camera, 9 numbers row by row) and ``translation`` (3 numbers), in OpenCV's axes.
 """
 
 from __future__ import annotations
@@ -27,9 +27,16 @@ from polarguide.geometry.scene_frame import SceneFrame, scene_frame
 from polarguide.geometry.vectors import dot, unit
 
 LARGEST_SIDE = 8192
+"""Maximum side of a picture in a file, in pixels."""
 MOST_FRAMES = 100_000
-REMEDY = "Give orbit, spiral, turntable, interpolate, or a JSON file with cameras as docs/how-to/export.md shows it."
+"""Maximum number of cameras in a file."""
+REMEDY = (
+    "Specify orbit, spiral, turntable or interpolate, or a JSON file with cameras as described in "
+    "docs/how-to/export.md."
+)
+"""Remedy of errors in camera paths."""
 Side = Annotated[int, Meta(ge=1, le=LARGEST_SIDE)]
+"""Side of a picture in a file."""
 
 
 def orbit(
@@ -40,13 +47,16 @@ def orbit(
     around: SceneFrame | None = None,
     distance: float | None = None,
 ) -> list[Camera]:
-    """Once around the scene at the cameras' median height and distance, beginning at the first camera's side.
+    """Return a path once around the scene at the cameras' median height and distance.
+
+    It starts on the side of the first camera and has the lens of this camera.
 
     Args:
-        cameras: cameras of the scene, at least one; the first one's lens is used.
-        frames: pictures, the last a step before the first. swing: up and down by this share of the distance, twice.
-        around: the scene's frame; that of the cameras if None.
-        distance: of the path from the frame's center, at the same elevation; that of the cameras if None.
+        cameras: cameras of the scene, at least one.
+        frames: number of pictures; the last one is a step before the first.
+        swing: amplitude of two vertical oscillations, as a share of the distance.
+        around: frame of the scene; None: the frame of the cameras.
+        distance: distance from the frame's center, at the same elevation; None: the distance of the cameras.
     """
     around = around or scene_frame(cameras)
     ahead, side = _level_axes(around, cameras[0].center)
@@ -55,9 +65,9 @@ def orbit(
     level = offsets - (offsets @ around.up)[:, None] * around.up
     radius = max(float(level.norm(dim=1).median()), 1e-6 * around.distance)
     if distance is not None:
-        nearer = distance / math.hypot(radius, height)
-        radius *= nearer
-        height *= nearer
+        scale = distance / math.hypot(radius, height)
+        radius *= scale
+        height *= scale
     path = []
     for k in range(frames):
         angle = 2 * math.pi * k / frames
@@ -69,9 +79,10 @@ def orbit(
 
 
 def interpolated(cameras: Sequence[Camera], frames: int) -> list[Camera]:
-    """A smooth path through cameras in their order: cubic splines of place and rotation (SciPy's ``RotationSpline``).
+    """Return a smooth path of ``frames`` cameras through given cameras, in their order.
 
-    Cameras that stand in the same place as the one before are left out.
+    Positions follow a cubic spline and rotations SciPy's ``RotationSpline``. A camera at the position of the previous
+    one is left out.
     """
     keyframes = list(cameras[:1])
     for camera in cameras[1:]:
@@ -94,7 +105,7 @@ def interpolated(cameras: Sequence[Camera], frames: int) -> list[Camera]:
 
 
 def _level_axes(around: SceneFrame, begin: Tensor) -> tuple[Tensor, Tensor]:
-    """Level directions from the center toward ``begin`` [3], and a quarter turn from it, counter-clockwise."""
+    """Return the level direction from the center to ``begin`` [3], and the direction a quarter turn to its left."""
     offset = begin - around.center
     level = offset - dot(offset, around.up) * around.up
     if float(level.norm()) < 1e-6 * around.distance:
@@ -104,7 +115,7 @@ def _level_axes(around: SceneFrame, begin: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def camera_record(camera: Camera) -> dict[str, Any]:
-    """A camera as the file holds it."""
+    """Return the record of a camera in a file."""
     return {
         **{key: getattr(camera, key) for key in ("width", "height", "fx", "fy", "cx", "cy")},
         "rotation": camera.rotation.flatten().tolist(),
@@ -113,7 +124,7 @@ def camera_record(camera: Camera) -> dict[str, Any]:
 
 
 class _CameraRecord(msgspec.Struct):
-    """A camera as the file holds it."""
+    """Camera in a file."""
 
     width: Side
     height: Side
@@ -126,15 +137,17 @@ class _CameraRecord(msgspec.Struct):
 
 
 class _PathRecord(msgspec.Struct):
+    """File with a camera path."""
+
     cameras: Annotated[list[_CameraRecord], Meta(min_length=1, max_length=MOST_FRAMES)]
     frames_per_second: Annotated[float, Meta(gt=0, le=1000)] = 30
 
 
 def read_path(path: Path) -> tuple[list[Camera], float]:
-    """Cameras of a file, and its frames a second (30 if it does not say).
+    """Read the cameras of a file and its frames per second, by default 30.
 
     Raises:
-        PolarguideError: no such file, or one that is not as the module says.
+        PolarguideError: the file does not exist, or differs from the format that the module describes.
     """
     record = read_record(path, _PathRecord, remedy=REMEDY)
     cameras = [_camera_of(camera, f"{path} (cameras[{k}]") for k, camera in enumerate(record.cameras)]
@@ -142,31 +155,28 @@ def read_path(path: Path) -> tuple[list[Camera], float]:
 
 
 def _camera_of(record: _CameraRecord, where: str) -> Camera:
-    lens = f"fx {record.fx:g}, fy {record.fy:g}, cx {record.cx:g}, cy {record.cy:g}"
-    size = f"{record.width} x {record.height}"
+    """Check a camera of a file; ``where`` names the file and the camera, with an open bracket."""
     place = list(record.translation)
-    _require_camera(
-        can_be_lens((record.width, record.height), (record.fx, record.fy), (record.cx, record.cy)),
-        f"{where})",
-        f"numbers up to {FARTHEST:g}, {LENS}",
-        f"{lens} for {size} pixels",
-    )
-    _require_camera(
-        max(map(abs, place)) <= FARTHEST, f"{where}.translation)", f"numbers up to {FARTHEST:g}", str(place)
-    )
     rotation = torch.tensor(record.rotation, dtype=torch.float64).reshape(3, 3)
-    turned = torch.dist(rotation @ rotation.T, torch.eye(3, dtype=torch.float64)) < 1e-3
-    _require_camera(
-        turned and float(torch.linalg.det(rotation)) > 0,
-        f"{where}.rotation)",
-        "a rotation",
-        str(list(record.rotation)),
-    )
+    is_orthogonal = torch.dist(rotation @ rotation.T, torch.eye(3, dtype=torch.float64)) < 1e-3
+    lens = f"fx {record.fx:g}, fy {record.fy:g}, cx {record.cx:g}, cy {record.cy:g}"
+    for is_valid, part, expected, found in (
+        (
+            can_be_lens((record.width, record.height), (record.fx, record.fy), (record.cx, record.cy)),
+            "",
+            f"numbers up to {FARTHEST:g}, {LENS}",
+            f"{lens} for {record.width} x {record.height} pixels",
+        ),
+        (max(map(abs, place)) <= FARTHEST, ".translation", f"numbers up to {FARTHEST:g}", str(place)),
+        (
+            is_orthogonal and float(torch.linalg.det(rotation)) > 0,
+            ".rotation",
+            "a rotation",
+            str(list(record.rotation)),
+        ),
+    ):
+        require(is_valid, f"{where}{part})", expected=expected, found=found, remedy=REMEDY)
     return Camera(
         record.width, record.height, record.fx, record.fy, record.cx, record.cy,
-        rotation, torch.tensor(record.translation, dtype=torch.float64),
+        rotation, torch.tensor(place, dtype=torch.float64),
     )  # fmt: skip
-
-
-def _require_camera(condition: object, where: str, expected: str, found: str) -> None:
-    require(condition, where, expected=expected, found=found, remedy=REMEDY)

@@ -10,6 +10,7 @@ from polarguide.capture.angle_evidence import (
     IDENTITY,
     ORDERS,
     PAIRINGS,
+    AngleLimits,
     FileOrder,
     Order,
     OrderEvidence,
@@ -17,27 +18,20 @@ from polarguide.capture.angle_evidence import (
     combine,
     posterior,
     swaps,
-    tolerance,
 )
 from polarguide.capture.calibration import Calibration, combined
 from polarguide.capture.view import ANGLES
 from polarguide.inspection.settings import Check, first_outcome
 
-DECIDED = 0.95
-"""Probability from which an order counts as decided."""
-ZERO_OFF = 3.0
-"""Zero offset in degrees above which the zero is wrong; half of it gives a warning."""
-ZERO_UNSURE = 3.0
-"""Standard error in degrees above which a zero offset gets no verdict."""
 FIX = "Write a corrected scene with --fix FOLDER"
 MOSAICS = {
-    (1, 45): "--flip x (Reverse X), or --flip 90 (turned counter-clockwise)",
-    (1, 135): "--flip y (Reverse Y), or --flip 270 (turned clockwise)",
+    (1, 45): "--flip x (Reverse X), or --flip 90 (rotated counter-clockwise)",
+    (1, 135): "--flip y (Reverse Y), or --flip 270 (rotated clockwise)",
     (1, 90): "--flip xy (Reverse X and Y), or --offset-x 1 --offset-y 1",
     (-1, 135): "--offset-x 1",
     (-1, 45): "--offset-y 1",
 }
-"""Sense and zero that geometry finds -> what makes such angles of the mosaics of a sensor."""
+"""Options for such angles of a sensor's mosaics, by sense and zero."""
 
 
 class Hypothesis(NamedTuple):
@@ -58,14 +52,14 @@ class Hypothesis(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class AngleFindings:
-    """The findings on the polarizer angles by geometry.
+    """Findings on the polarizer angles by geometry.
 
     Attributes:
         pairing: index into ``PAIRINGS``, from the pair sums.
         sources: the evidence.
         posterior: posterior of all usable evidence together; None without usable evidence.
         applied: calibration that ``prepare`` applied; None for a scene of another origin.
-        mosaic: true if ``prepare`` made the pictures of mosaics of a sensor.
+        mosaic: True if ``prepare`` developed mosaics of a sensor.
     """
 
     pairing: int
@@ -75,32 +69,30 @@ class AngleFindings:
     mosaic: bool = False
 
     def correction(self, offset: float) -> str:
-        """Return the advice for a decided order and an offset: the whole calibration, not the difference."""
+        """Return the advice for a decided order and an offset: the complete calibration, not the difference."""
         if self.order is None or self.files is None:
             return ""
         if self.applied is None:
             return f"{FIX}."
-        straight = self.applied.true_angles() == (ANGLES, 0.0) and abs(offset) <= ZERO_OFF
-        options = MOSAICS.get((self.order.sense, self.order.zero)) if self.mosaic and straight else None
+        unchanged = self.applied.true_angles() == (ANGLES, 0.0) and abs(offset) <= AngleLimits.zero_off
+        options = MOSAICS.get((self.order.sense, self.order.zero)) if self.mosaic and unchanged else None
         if options is not None:
             return (
-                "A sensor's angles are fixed: the mosaics were mirrored or turned, or their region begins elsewhere. "
+                "A sensor's angles are fixed: the mosaics were mirrored or rotated, or their region starts elsewhere. "
                 f"Repeat prepare with {options} and a new --out."
             )
         whole = combined(self.applied, Calibration(order=self.files, zero=round(offset, 1)))
         if whole is None:
             return f"{FIX}."
         return (
-            f"{FIX}, or repeat prepare with {whole.options()} and a new --out. That is the whole calibration; the "
+            f"{FIX}, or repeat prepare with {whole.options()} and a new --out. This is the complete calibration; the "
             f"scene was prepared with {self.applied.options()}."
         )
 
     @property
     def order(self) -> Order | None:
         """The order, or None if it is not decided."""
-        if self.posterior is None or max(self.posterior.probabilities) < DECIDED:
-            return None
-        return ORDERS[self.posterior.best]
+        return None if self.posterior is None else self.posterior.order
 
     @property
     def files(self) -> FileOrder | None:
@@ -118,10 +110,10 @@ class AngleFindings:
     @property
     def offset(self) -> float | None:
         """The significant zero offset relative to the order, in degrees; None without one."""
-        found = self.posterior
-        if self.order is None or found is None or found.offset_error > ZERO_UNSURE:
+        zero = self.posterior
+        if self.order is None or zero is None or not zero.is_precise or not zero.is_off(AngleLimits.zero_off):
             return None
-        return found.offset if abs(found.offset) > tolerance(ZERO_OFF, found.offset_error) else None
+        return zero.offset
 
     def record(self) -> dict[str, Any]:
         """Return the findings as JSON types."""
@@ -162,33 +154,27 @@ def combine_evidence(
 
 def angle_checks(angles: AngleFindings) -> list[Check]:
     """Check order, sense and zero of the angles."""
-    found = angles.posterior
-    more = "Give the scene poses (polarguide prepare ... --poses sfm) and inspect it again."
+    more = "Prepare the scene with poses (polarguide prepare ... --poses sfm) and inspect it again."
     if angles.sources:
         more = (
-            "Take views from more directions, also rolled or slanted ones, of curved glossy dielectrics; or train "
-            "longer with --steps. The sense needs surfaces that face different ways in the picture; the multiple of "
+            "Take views from more directions, including rolled or slanted ones, of curved glossy dielectrics; or train "
+            "longer with --steps. The sense needs surfaces with different directions in the picture. The multiple of "
             "90 degrees needs strong reflections."
         )
-    if found is not None:
-        return [
-            _order_check(angles, found, more),
-            _sense_check(angles, found, more),
-            _zero_check(angles, found, more),
-        ]
+    if angles.posterior is not None:
+        checks = (_order_check, _sense_check, _zero_check)
+        return [check(angles, angles.posterior, more) for check in checks]
     notes = " ".join(evidence.note for evidence in angles.sources)
-    finding = "This check needs poses, which the scene does not have."
-    if notes:
-        finding = f"Geometry does not decide it. {notes}"
+    finding = f"Geometry does not decide it. {notes}" if notes else "This check needs poses."
     return [
         Check("angle_order", "not verified", finding, more, figures=angles.record()),
         *(Check(key, "not verified", finding, more) for key in ("handedness", "zero_offset")),
     ]
 
 
-def _order_check(angles: AngleFindings, found: OrderPosterior, more: str) -> Check:
-    """Check whether the pictures are named by their true angles."""
-    probability = max(found.probabilities)
+def _order_check(angles: AngleFindings, posterior: OrderPosterior, more: str) -> Check:
+    """Check if the pictures are named by their true angles."""
+    probability = max(posterior.probabilities)
     likely = sorted(
         (row for row in angles.hypotheses if row.probability > 0.02), key=lambda row: -row.probability
     )
@@ -216,12 +202,12 @@ def _order_check(angles: AngleFindings, found: OrderPosterior, more: str) -> Che
     return Check("angle_order", *outcome, figures=angles.record())
 
 
-def _sense_check(angles: AngleFindings, found: OrderPosterior, more: str) -> Check:
-    """Check whether the angles increase counter-clockwise as displayed."""
-    probability = found.sense_probability
+def _sense_check(angles: AngleFindings, posterior: OrderPosterior, more: str) -> Check:
+    """Check if the angles increase counter-clockwise as displayed."""
+    probability = posterior.sense_probability
     outcome = first_outcome(
         (
-            max(probability, 1 - probability) < DECIDED,
+            max(probability, 1 - probability) < AngleLimits.decided,
             "warning",
             f"Not decided: counter-clockwise with a probability of {probability:.0%}.",
             more,
@@ -235,28 +221,28 @@ def _sense_check(angles: AngleFindings, found: OrderPosterior, more: str) -> Che
         (
             True,
             "wrong",
-            f"Clockwise as displayed, with a probability of {1 - probability:.1%}: clockwise angles, "
-            "a mirrored picture and two exchanged files look the same.",
+            f"Clockwise as displayed, with a probability of {1 - probability:.1%}. Clockwise angles, a mirrored "
+            "picture and two exchanged files look the same.",
             angles.correction(angles.offset or 0.0) or more,
         ),
     )
     return Check("handedness", *outcome, figures={"counter_clockwise": probability})
 
 
-def _zero_check(angles: AngleFindings, found: OrderPosterior, more: str) -> Check:
-    """Check whether a polarizer angle of 0 degrees is the image's horizontal."""
-    offset = found.offset
-    error = found.offset_error
-    about = "" if angles.order in (None, IDENTITY) else " (relative to the order found above)"
-    finding = f"The zero of the instrument lies at {offset:+.1f}° ± {error:.1f}°{about}."
+def _zero_check(angles: AngleFindings, posterior: OrderPosterior, more: str) -> Check:
+    """Check if a polarizer angle of 0 degrees is the image's horizontal."""
+    offset = posterior.offset
+    error = posterior.offset_error
+    relation = "" if angles.order in (None, IDENTITY) else " (relative to the order above)"
+    finding = f"The zero of the instrument is at {offset:+.1f}° ± {error:.1f}°{relation}."
     outcome = first_outcome(
         (
-            error > ZERO_UNSURE,
+            not posterior.is_precise,
             "warning",
             f"The standard error of the zero is {error:.1f}°: too large to decide.",
             more,
         ),
-        (abs(offset) <= tolerance(ZERO_OFF / 2, error), "ok", finding, ""),
+        (not posterior.is_off(AngleLimits.zero_off / 2), "ok", finding, ""),
         (True, "warning" if angles.offset is None else "wrong", finding, angles.correction(offset) or more),
     )
     return Check("zero_offset", *outcome, figures={"offset_degrees": offset, "error_degrees": error})

@@ -1,4 +1,4 @@
-"""Read a capture for inspection; it may have no poses, or poses for some of its views only."""
+"""Capture for an inspection. Poses may be missing, for all or some of its views."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from polarguide.capture.calibration import Calibration
 from polarguide.capture.colmap.model import ColmapModel, read_model
 from polarguide.capture.exposures import FOUR, Exposure
 from polarguide.capture.formats.pictures import TRANSFERS, decode_picture, read_picture
-from polarguide.capture.layout import Layout, find_layout, select_views
+from polarguide.capture.layout import CaptureFiles, find_layout, select_views
 from polarguide.capture.metadata import (
     Origin,
     applied_calibration,
@@ -38,21 +38,21 @@ from polarguide.core.records import LARGEST_RECORD
 from polarguide.geometry.camera import Camera
 
 LONGEST = 640
-"""Pixels of the longer side that pictures are averaged down to (by whole factors)."""
+"""Largest longer side in pixels after averaging by whole factors."""
 
 
 @dataclass(frozen=True, eq=False)
 class InspectedView:
-    """The pictures of a view, four mostly, and its pose if it has one.
+    """Pictures of a view, usually four, and its pose if it has one.
 
     Attributes:
         name: name of the view.
         codes: linear intensities as in ``View.codes``, [K, H, W, 3] uint16.
         invalid, saturated: as in ``View``, [H, W] bool.
-        black: pixels that are 0 in all angles; they count as ``saturated``, too.
-        camera: at the size of ``codes``, or None.
+        black: pixels that are 0 in all angles; they are also ``saturated``.
+        camera: camera at the size of ``codes``, or None.
         peak: largest stored value.
-        exposures: what the pictures are.
+        exposures: exposures of the pictures.
     """
 
     name: str
@@ -65,12 +65,12 @@ class InspectedView:
     exposures: tuple[Exposure, ...] = FOUR
 
     def intensities(self) -> Tensor:
-        """Linear intensities in [0, 1], at 0, 45, 90, 135 degrees mostly, as the files say: [K, H, W, 3] float32."""
+        """Return linear intensities in [0, 1] at the stated angles, [K, H, W, 3] float32."""
         return self.codes.to(torch.float32) / FULL_CODE
 
     @property
     def usable(self) -> Tensor:
-        """Pixels that carry a measurement, [H, W] bool."""
+        """Pixels with a measurement, [H, W] bool."""
         return ~(self.invalid | self.saturated)
 
 
@@ -83,18 +83,18 @@ class Capture:
         views: all views, sorted by name.
         model: its COLMAP model, or None.
         refractive_index: as ``scene.json`` gives it, or None.
-        applied: order, sense and zero that ``prepare`` made the pictures with; None for a scene of another origin.
+        applied: order, sense and zero that ``prepare`` applied; None for a scene of another origin.
         factor: side of the averaged pixel boxes. transfer: how the files were read.
         bits: bits of the files. size: width and height of the pictures as stored.
         digest: SHA-256 over the stored pictures.
-        origin: the files that ``prepare`` made the pictures of.
-        exposures: of the views by points in common; None where they are not compared.
-        keeps_gains: whether ``prepare --gains none`` leaves them.
+        origin: kind of files that ``prepare`` developed.
+        exposures: exposures of the views by shared points, or None.
+        keeps_gains: True for scenes of ``prepare --gains none``.
     """
 
     root: Path
     name: str
-    layout: Layout
+    layout: CaptureFiles
     views: tuple[InspectedView, ...]
     model: ColmapModel | None
     refractive_index: float | None
@@ -114,9 +114,14 @@ class Capture:
         return all(view.exposures == FOUR for view in self.views)
 
     @property
+    def cameras(self) -> list[tuple[InspectedView, Camera]]:
+        """The views with a pose, and their cameras."""
+        return [(view, view.camera) for view in self.views if view.camera is not None]
+
+    @property
     def posed(self) -> tuple[InspectedView, ...]:
         """The views with a pose."""
-        return tuple(view for view in self.views if view.camera is not None)
+        return tuple(view for view, _ in self.cameras)
 
 
 def read_capture(
@@ -147,7 +152,7 @@ def read_capture(
     factor = downscale or _fitting_factor(layout, names[0])
     stored = read_views(layout, names, model, downscale=factor, transfer=transfer, reporter=reporter)
     lines = sorted(f"{p.relative_to(root)} {d}" for item in stored.data for p, d in item.digests.items())
-    indices_of(metadata, text)  # that it can be read
+    indices_of(metadata, text)  # raises an error for invalid indices
     return Capture(
         root=root,
         name=root.resolve().name,
@@ -167,7 +172,7 @@ def read_capture(
     )
 
 
-def _fitting_factor(layout: Layout, name: str) -> int:
+def _fitting_factor(layout: CaptureFiles, name: str) -> int:
     path = layout.files(name)[0]
     height, width = decode_picture(path, read_picture(path)).shape[:2]
     return max(1, math.ceil(max(height, width) / LONGEST))
@@ -188,9 +193,9 @@ def _inspected(stored: StoredViews, number: int) -> InspectedView:
 
 
 MEASURABLE = 1.0 / 256.0
-"""Mean intensity from which on a pixel is bright enough for its polarization to be measured: a step of 8 bits."""
+"""Smallest mean intensity of a pixel whose polarization can be measured: a step of 8 bits."""
 POLARIZED = 0.05
-"""DoLP from which a pixel counts as polarized."""
+"""Smallest DoLP of a polarized pixel."""
 OF_FOUR = ("noise", "noise_share", "pair_ratio", "sum_error", "dolp", "polarized", "above_limit")
 """Measurements that need four angles of a view."""
 _QUANTILE_SAMPLES = 200_000
@@ -198,22 +203,24 @@ _QUANTILE_SAMPLES = 200_000
 
 @dataclass(frozen=True)
 class ViewMeasurements:
-    """Measurements of one view. ``saturated``, ``invalid`` and ``dark`` are shares of all pixels, others of the usable.
+    """Measurements of one view.
+
+    ``saturated``, ``invalid`` and ``dark`` are shares of all pixels, others of usable pixels.
 
     Attributes:
         view: its name.
         bright: 99th percentile of the intensities, in [0, 1].
-        saturated, invalid, dark: shares of pixels with an angle at full scale, marked invalid by the capture though
-            they are not dark, and darker than 1/256.
-        noise: median standard deviation of the noise of one intensity (mean over the colors), after averaging down.
+        saturated: share of pixels with an angle at full scale. invalid: share of pixels that the capture marks invalid
+            although they are not dark. dark: share of pixels below 1/256.
+        noise: median standard deviation of the noise of one intensity (mean over the colors), after averaging.
         noise_share: the same, as a share of S0 / 2.
-        pair_ratio: median of (I0 + I90) / (I45 + I135); None where too few pixels are bright enough.
+        pair_ratio: median of (I0 + I90) / (I45 + I135); None if too few pixels are bright enough.
         sum_error: median of |I0 + I90 - I45 - I135| / S0.
         dolp: quantiles 0.5 and 0.99 of the DoLP.
-        polarized: share with a DoLP over 0.05 and over three times its noise.
-        above_limit: share with a DoLP over the limit of diffuse light by three times its noise.
-        exposures: the angles of its pictures where they are not 0, 45, 90 and 135 degrees; then noise and all that
-            follows from four angles is not measured.
+        polarized: share with a DoLP above 0.05 and above three times its noise.
+        above_limit: share with a DoLP above the limit of diffuse light by three times its noise.
+        exposures: angles of other pictures than 0, 45, 90 and 135 degrees. Values that need four angles are then not
+            measured.
     """
 
     view: str
@@ -242,7 +249,7 @@ def measure_view(view: InspectedView, index: float) -> ViewMeasurements:
     """Measure one view.
 
     Args:
-        view: its pictures.
+        view: the view.
         index: refractive index.
     """
     gray = view.intensities().mean(dim=-1)
@@ -250,14 +257,14 @@ def measure_view(view: InspectedView, index: float) -> ViewMeasurements:
     good = view.usable & ~dark
     share = float(good.float().mean())
     bright = quantile(view.intensities().amax(dim=-1).flatten(), 0.99)
-    # Black is no fault: prepare marks it invalid, because nothing can be read from it.
-    lost = (view.saturated & ~view.black, view.invalid & ~dark, dark)
-    saturated, invalid, black = (float(mask.float().mean()) for mask in lost)
-    nothing = ViewMeasurements(view.name, bright, saturated, invalid, black)
+    # Black is not a fault. prepare marks it invalid because it has no information.
+    unusable = (view.saturated & ~view.black, view.invalid & ~dark, dark)
+    saturated, invalid, black = (float(mask.float().mean()) for mask in unusable)
+    measured = ViewMeasurements(view.name, bright, saturated, invalid, black)
     if view.exposures != FOUR:
-        return replace(nothing, exposures=", ".join(exposure.words for exposure in view.exposures))
+        return replace(measured, exposures=", ".join(exposure.label for exposure in view.exposures))
     if share < 0.001:
-        return nothing
+        return measured
     stokes = optics.stokes(gray)
     noise = optics.intensity_noise(gray)
     i0, i45, i90, i135 = (angle[good] for angle in gray)
@@ -266,7 +273,7 @@ def measure_view(view: InspectedView, index: float) -> ViewMeasurements:
     spread = optics.dolp_noise(stokes, noise)[good]
     limit = float(optics.diffuse_dolp_limit(index))
     return replace(
-        nothing,
+        measured,
         noise=quantile(noise[good], 0.5),
         noise_share=quantile(noise[good] / (s0 / 2), 0.5),
         pair_ratio=quantile((i0 + i90) / (i45 + i135).clamp(min=1e-6), 0.5),
@@ -278,7 +285,7 @@ def measure_view(view: InspectedView, index: float) -> ViewMeasurements:
 
 
 def quantile(values: Tensor, q: float) -> float:
-    """Quantile of the values; of a regular subset where there are very many."""
+    """Return a quantile of the values, or of a regular subset of many values."""
     step = max(1, values.numel() // _QUANTILE_SAMPLES)
-    # NumPy selects where torch sorts, which takes many times as long.
+    # NumPy selects and torch sorts, which is much slower.
     return float(np.quantile(values.flatten()[::step].numpy(), q))

@@ -1,12 +1,13 @@
-"""Corrections of a capture: of its angles, as a new scene; of its sensor's analyzers, in memory."""
+"""Corrections of a capture: of its angles, as a new scene; and of its sensor's analyzers, in memory."""
 
 from __future__ import annotations
 
 import os
 import shutil
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -19,11 +20,12 @@ from polarguide.capture import box_filter
 from polarguide.capture.angle_evidence import swaps
 from polarguide.capture.calibration import UNIT_GAINS, Calibration, oriented
 from polarguide.capture.colmap.model import MODELS
-from polarguide.capture.colmap.poses import Geometry, undistortion
+from polarguide.capture.colmap.poses import undistortion
 from polarguide.capture.formats.pictures import SUFFIXES
 from polarguide.capture.layout import describe_contents, index_files
 from polarguide.capture.presentation import PRESENTATION_FILE
 from polarguide.capture.sensor.analyzers import AnalyzerCalibration, read_analyzers
+from polarguide.capture.sensor.pattern import MosaicOptions
 from polarguide.capture.view import ANGLES, FULL_CODE
 from polarguide.capture.view_reader import read_view
 from polarguide.capture.write import intensity_codes, write_view
@@ -34,6 +36,7 @@ from polarguide.core.records import decode, read_record, shortened, to_json
 from polarguide.inspection.angles import AngleFindings
 from polarguide.inspection.capture import Capture, InspectedView
 from polarguide.inspection.settings import Check
+from polarguide.preparation.journal import FourFactors, State, ViewRecord
 
 _COPIED = ("sparse", "masks", "invalid", "gt", "split.json", PRESENTATION_FILE)
 """Files and folders that are copied unchanged."""
@@ -51,7 +54,7 @@ def correction(capture: Capture, angles: AngleFindings) -> Calibration | None:
             capture.root,
             expected="a decided order of the angles",
             found="an order that geometry does not decide",
-            remedy="Nothing was written. The report says what to do; --order of prepare sets it by hand.",
+            remedy="Nothing was written. Follow the report, or set the order with --order of prepare.",
         )
     change = Calibration(order=angles.files, zero=round(angles.offset or 0.0, 2))
     return None if change == Calibration() else change
@@ -60,16 +63,16 @@ def correction(capture: Capture, angles: AngleFindings) -> Calibration | None:
 def fix_scene(capture: Capture, change: Calibration, out: Path, reporter: Reporter = SILENT) -> str:
     """Write a corrected copy of a scene; the scene itself does not change.
 
-    If only the order changes, files are copied under their right names, byte by byte. If the zero changes, the four
-    intensities are computed anew and written as linear 16-bit PNG; they are divided by 1.21 so that none exceeds full
+    If only the order changes, files are copied byte by byte under their right names. If the zero changes, the four
+    intensities are recomputed and written as linear 16-bit PNG. They are divided by 1.21 so that no value exceeds full
     scale, and saturated pixels become invalid. The folder appears when it is complete.
 
     Args:
-        capture: the scene. change: from ``correction``. out: a new folder.
+        capture: the scene. change: result of ``correction``. out: a new folder.
         reporter: receives the progress.
 
     Returns:
-        A description of what was done.
+        A description of the correction.
 
     Raises:
         PolarguideError: ``out`` exists, or a file cannot be read or written.
@@ -80,7 +83,7 @@ def fix_scene(capture: Capture, change: Calibration, out: Path, reporter: Report
             out,
             expected="a new folder",
             found="a file" if not out.is_dir() else describe_contents(out),
-            remedy="Give another --fix; nothing was written.",
+            remedy="Choose another --fix. Nothing was written.",
         )
     with temporary_folder(out) as partial:
         _write(capture, change, partial, reporter)
@@ -120,20 +123,19 @@ def _write(capture: Capture, change: Calibration, folder: Path, reporter: Report
 
 
 def _require_inside(root: Path, source: Path) -> None:
-    """Refuse links that leave the scene: their targets are not files of the scene, and would be copied.
+    """Refuse links to files outside of the scene, because their targets would be copied.
 
     Raises:
-        PolarguideError: there is one.
+        PolarguideError: such a link exists.
     """
-    whole = root.resolve()
     for path in (source, *(source.rglob("*") if source.is_dir() else ())):
         circular = path != source and path.is_symlink() and path.is_dir()
-        if circular or (path.exists() and not path.resolve().is_relative_to(whole)):
+        if circular or (path.exists() and not path.resolve().is_relative_to(root.resolve())):
             raise PolarguideError(
                 path,
                 expected="a file of the scene",
                 found=f"a link to {path.resolve()}",
-                remedy="Copy into the scene what it points to, or remove it; nothing was written.",
+                remedy="Replace the link by a copy, or remove it. Nothing was written.",
             )
 
 
@@ -149,7 +151,7 @@ def _rotate_view(capture: Capture, change: Calibration, folder: Path, view: str)
 
 
 def _corrected_metadata(capture: Capture, change: Calibration) -> bytes:
-    """``scene.json`` of the copy: that of the scene, with a note on the correction."""
+    """Return ``scene.json`` of the copy: the scene's, with a note on the correction."""
     path = capture.root / METADATA
     content: dict[str, Any] = read_record(path, dict[str, Any]) if path.exists() else {}
     note = {
@@ -166,64 +168,31 @@ def _corrected_metadata(capture: Capture, change: Calibration) -> bytes:
 
 
 STEPS = (1, 2, 4)
-"""Pixels of the sensor for each of the picture, that ``prepare`` makes."""
+"""Sensor pixels per pixel of a picture that ``prepare`` writes."""
 _REMEDY = "Prepare the mosaics with it: polarguide prepare RAW --out SCENE --calibration FILE."
-
-
-class _Analyzers(msgspec.Struct):
-    sensor: str
-    lens: str = ""
-    sha256: str = ""
-
-
-class _Warp(msgspec.Struct):
-    model: str
-    parameters: list[float]
-
-
-_Gain = Annotated[float, msgspec.Meta(gt=0, le=1e6)]
-
-
-class _PreparedView(msgspec.Struct):
-    geometry: Geometry
-    warp: _Warp | None = None
-
-
-class _MosaicOffsets(msgspec.Struct):
-    offset_x: int = 0
-    offset_y: int = 0
-
-
-class _PrepareRequest(msgspec.Struct):
-    settings: _MosaicOffsets = msgspec.field(default_factory=_MosaicOffsets)
-
-
-class _PrepareNotes(msgspec.Struct):
-    request: _PrepareRequest = msgspec.field(default_factory=_PrepareRequest)
-    views: dict[str, _PreparedView] = {}
 
 
 class _SceneNotes(msgspec.Struct):
     """The fields of ``scene.json`` that are read; ``sensor`` is an object in scenes of ``synth``."""
 
     sensor: str | dict[str, Any] | None = None
-    gains: tuple[_Gain, _Gain, _Gain, _Gain] | None = None
-    analyzers: _Analyzers | None = None
-    prepare: _PrepareNotes | None = None
+    gains: FourFactors | None = None
+    analyzers: dict[str, str] | None = None
+    prepare: State[Any] | None = None
 
 
 def corrected(capture: Capture, path: Path) -> Capture:
     """Return the capture corrected with the calibration of its sensor.
 
-    The matrices follow what ``prepare`` did: its region, the gains that it divided by, the order of the angles, the
-    removal of the distortion. Where pictures were averaged, so are the matrices.
+    The matrices follow the steps of ``prepare``: its region, gains, order of the angles, and undistortion. They are
+    averaged like the pictures.
 
     Args:
-        capture: of a scene of one sensor's mosaics, or of four pictures a view at its size, half or a quarter of it.
+        capture: scene of one sensor's mosaics, or four pictures per view at its full, half or quarter size.
         path: a file of ``polarguide calibrate``.
 
     Raises:
-        PolarguideError: the file cannot be used, is of another sensor or size, or has been applied already.
+        PolarguideError: the file is invalid, belongs to another sensor or size, or has been applied already.
     """
     calibration = read_analyzers(path)
     notes = _notes(capture)
@@ -231,44 +200,44 @@ def corrected(capture: Capture, path: Path) -> Capture:
         raise PolarguideError(
             capture.root,
             expected="a scene that was prepared without --calibration",
-            found=f"the calibration of {notes.analyzers.sensor} (checksum {notes.analyzers.sha256[:16]}...)",
-            remedy="Leave --calibration out.",
+            found=_calibration_name(notes.analyzers),
+            remedy="Omit --calibration.",
         )
     if isinstance(notes.sensor, dict) or (notes.prepare is not None and notes.sensor is None):
         raise PolarguideError(
             capture.root,
             expected="a scene of the mosaics of a sensor",
             found="a scene of shots through a filter, of a dataset, or rendered",
-            remedy="Leave --calibration out.",
+            remedy="Omit --calibration.",
         )
     calibration.require_sensor(notes.sensor, path)
     applied = capture.applied
-    turned = notes.prepare is not None if applied is None else not applied.permutes
-    if turned:
+    rotated = notes.prepare is not None if applied is None else not applied.permutes
+    if rotated:
         raise PolarguideError(
             capture.root,
             expected="angles in steps of 45 degrees from those of the sensor",
-            found="a scene whose zero was turned",
+            found="a scene with another zero",
             remedy=_REMEDY,
         )
-    known: dict[bytes, NDArray[np.float32]] = {}
+    cache: dict[bytes, NDArray[np.float32]] = {}
     views = []
     for view in capture.views:
         prepared = None if notes.prepare is None else notes.prepare.views.get(view.name)
-        key = msgspec.json.encode(prepared)
-        if key not in known:
-            matrices = _as_named(
+        key = b"" if prepared is None else msgspec.json.encode((prepared.geometry, prepared.warp))
+        if key not in cache:
+            matrices = _by_true_angle(
                 _matrices(calibration, notes, prepared, capture, view.name), applied, notes.gains
             )
             boxes = box_filter.mean(np.moveaxis(matrices, (2, 3), (0, 1)), capture.factor)
-            known[key] = np.moveaxis(boxes, (0, 1), (2, 3))
-            if known[key].shape[2:4] != view.codes.shape[1:3]:
-                raise _changed(capture, view.name, "a size that its pictures have not")
-        views.append(_corrected_view(view, known[key]))
+            cache[key] = np.moveaxis(boxes, (0, 1), (2, 3))
+            if cache[key].shape[2:4] != view.codes.shape[1:3]:
+                raise _record_fault(capture, view.name, "a size that differs from its pictures")
+        views.append(_corrected_view(view, cache[key]))
     return replace(capture, views=tuple(views))
 
 
-def _changed(capture: Capture, view: str, found: str) -> PolarguideError:
+def _record_fault(capture: Capture, view: str, found: str) -> PolarguideError:
     return PolarguideError(
         f"{capture.root / METADATA} (prepare.views.{view})",
         expected="the record that prepare wrote",
@@ -277,22 +246,24 @@ def _changed(capture: Capture, view: str, found: str) -> PolarguideError:
     )
 
 
+def _calibration_name(record: Mapping[str, str]) -> str:
+    """Return the name of a calibration by its record, for messages."""
+    lens = f" and {record['lens']}" if record.get("lens") else ""
+    return f"the calibration of {record.get('sensor', '')}{lens} ({record.get('sha256', '')[:16]})"
+
+
 def analyzer_check(capture: Capture, path: Path | None) -> Check | None:
-    """Report the calibration of the sensor's analyzers; None where nothing was calibrated."""
+    """Report the calibration of the sensor's analyzers; None without one."""
     if path is not None:
         record = read_analyzers(path).record()
-        text = "Corrected for this inspection with"
-        remedy = "The scene itself is as it was: prepare its mosaics with --calibration."
-    else:
-        analyzers = _notes(capture).analyzers
-        if analyzers is None:
-            return None
-        record = msgspec.to_builtins(analyzers)
-        text = "Prepared with"
-        remedy = ""
-    lens = f" and {record['lens']}" if record["lens"] else ""
-    finding = f"{text} the calibration of {record['sensor']}{lens} ({record['sha256'][:16]})."
-    return Check("analyzers", "ok", finding, remedy, figures=record)
+        finding = f"Corrected for this inspection with {_calibration_name(record)}."
+        remedy = "The scene itself is unchanged: prepare its mosaics with --calibration."
+        return Check("analyzers", "ok", finding, remedy, figures=record)
+    analyzers = _notes(capture).analyzers
+    if analyzers is None:
+        return None
+    finding = f"Prepared with {_calibration_name(analyzers)}."
+    return Check("analyzers", "ok", finding, figures=analyzers)
 
 
 def _notes(capture: Capture) -> _SceneNotes:
@@ -304,7 +275,7 @@ def _notes(capture: Capture) -> _SceneNotes:
 def _matrices(
     calibration: AnalyzerCalibration,
     notes: _SceneNotes,
-    prepared: _PreparedView | None,
+    prepared: ViewRecord | None,
     capture: Capture,
     view: str,
 ) -> NDArray[np.float32]:
@@ -315,19 +286,19 @@ def _matrices(
     """
     if prepared is None or notes.prepare is None:
         return calibration.of_pictures(capture.size[::-1])
-    settings = notes.prepare.request.settings
+    options = decode(notes.prepare.request.settings, MosaicOptions, capture.root / METADATA)
     geometry = prepared.geometry
     if geometry.step not in STEPS:
-        raise _changed(capture, view, f"a step of {geometry.step}")
+        raise _record_fault(capture, view, f"a step of {geometry.step}")
     matrices = calibration.of_pictures(
-        geometry.size[::-1], offset=(settings.offset_x, settings.offset_y), scale=geometry.step
+        geometry.size[::-1], offset=(options.offset_x, options.offset_y), scale=geometry.step
     )
     if prepared.warp is None:
         return matrices
     model = prepared.warp.model
     parameters = prepared.warp.parameters
     if model not in MODELS or len(parameters) != MODELS[model][1]:
-        raise _changed(capture, view, f"a camera {shortened(model)} with {len(parameters)} parameters")
+        raise _record_fault(capture, view, f"a camera {shortened(model)} with {len(parameters)} parameters")
     width, height = geometry.size
     camera = pycolmap.Camera(model=model, width=width, height=height, params=parameters)
     planes = matrices.reshape(16, *matrices.shape[2:])
@@ -335,10 +306,10 @@ def _matrices(
     return moved.reshape(4, 4, *moved.shape[1:])
 
 
-def _as_named(
+def _by_true_angle(
     matrices: NDArray[np.float32], applied: Calibration | None, gains: tuple[float, ...] | None
 ) -> NDArray[np.float32]:
-    """Matrices for pictures that were divided by gains, and then named by their true angles."""
+    """Return matrices for pictures that were divided by gains and then named by their true angles."""
     scaled = matrices * np.asarray(gains or UNIT_GAINS, np.float32).reshape(1, 4, *[1] * (matrices.ndim - 2))
     if applied is None:
         return scaled
@@ -349,8 +320,7 @@ def _as_named(
 def _corrected_view(view: InspectedView, matrices: NDArray[np.float32]) -> InspectedView:
     stored = view.codes.numpy().astype(np.float32)
     weights = matrices if matrices.ndim == 5 else matrices[..., None]
-    done = np.stack([sum(weights[k, j] * stored[j] for j in range(4)) for k in range(4)])
-    over = (done > FULL_CODE).any(axis=(0, 3))
-    saturated = view.saturated | torch.from_numpy(over)
-    codes = np.rint(np.clip(done, 0, FULL_CODE)).astype(np.uint16)
+    values = np.stack([sum(weights[k, j] * stored[j] for j in range(4)) for k in range(4)])
+    saturated = view.saturated | torch.from_numpy((values > FULL_CODE).any(axis=(0, 3)))
+    codes = np.rint(np.clip(values, 0, FULL_CODE)).astype(np.uint16)
     return replace(view, codes=torch.from_numpy(codes), saturated=saturated)

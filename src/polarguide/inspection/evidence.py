@@ -1,13 +1,12 @@
-"""Evidence on the angles from surface normals.
+"""Evidence on the angles from surface normals and points.
 
-Specular light is polarized perpendicular to the plane of incidence, diffuse light parallel to it. The normals come from
-a short training on the photographs alone, which do not depend on the order of the four pictures. The AoLP agrees with
-their azimuth modulo 90 degrees; the multiple of 90 degrees follows from certainly specular pixels, whose DoLP exceeds
-that of diffuse light at their zenith.
+Specular light is polarized perpendicular to the plane of incidence, diffuse light parallel to it. Normals come from a
+short training on photographs, the means of the four pictures. They do not depend on the order of the pictures, so a
+comparison with the AoLP is valid, and remains valid after a correction of the order. The state of the training is kept
+in a folder and resumed.
 
-The training is kept in a folder so that it goes on. The photograph is the mean of the four pictures, the same in every
-order of them; so what comes out may be compared with the AoLP without begging the question, and stays good after the
-order is put right.
+AoLP and azimuth of the normals agree modulo 90 degrees. The multiple of 90 degrees follows from certainly specular
+pixels, whose DoLP exceeds that of diffuse light at their zenith.
 """
 
 from __future__ import annotations
@@ -63,28 +62,35 @@ POINTS = "points observed in several views"
 _SENSES = torch.tensor(SENSES)[:, None]
 
 
+def training_recipe(name: str) -> Recipe:
+    """Return a recipe with stages by its name."""
+    recipe = recipe_named(name)
+    assert isinstance(recipe, Recipe)
+    return recipe
+
+
 class EvidenceLimits:
     """Constants of the evidence.
 
     Attributes:
         samples: largest number of pixels that are sampled in a view.
-        zenith_margin: error of a rendered zenith, radians, up to which a pixel still counts as certainly specular.
-        least_zenith: zenith of a normal from which on its azimuth is reliable, radians.
-        least_dolp: DoLP from which on the AoLP of a pixel is used.
-        fewest_pixels: pixels with a normal that the evidence needs.
-        least_inliers: least share of pixels whose normals agree.
+        zenith_margin: largest error of a rendered zenith of certainly specular pixels, radians.
+        least_zenith: smallest zenith of a normal with a reliable azimuth, radians.
+        least_dolp: smallest DoLP of a pixel with a usable AoLP.
+        fewest_pixels: number of pixels with a normal that the evidence needs.
+        least_inliers: smallest share of pixels whose normals agree.
         largest_error: largest error of the normals, radians.
-        least_concentration: least length of the mean of ``exp(4 i (AoLP - azimuth))``: 1 for agreement modulo 90
+        least_concentration: smallest length of the mean of ``exp(4 i (AoLP - azimuth))``: 1 for agreement modulo 90
             degrees, 0 for none.
         specular: share of certainly specular pixels that are polarized perpendicular to the plane of incidence.
-        normal_errors: errors of normals that are tried, radians.
-        inliers: shares of agreeing pixels that are tried.
-        fewest_observations: views that a point has to be observed in.
-        fewest_points: points that the evidence needs.
-        largest_misfit: median angle in degrees between fields and their common plane above which points are not used.
-        least_scale: smallest mean square of the fields' components along a normal that counts.
-        opaque: alpha from which on a rendered normal counts.
-        agreement: least cosine between the rendered normal and that of the depth.
+        normal_errors: candidates for the error of normals, radians.
+        inliers: candidates for the share of agreeing pixels.
+        fewest_observations: number of views that must observe a point.
+        fewest_points: number of points that the evidence needs.
+        largest_misfit: largest median angle in degrees between fields and their common plane.
+        least_scale: lower bound of the mean square of the fields' components along a normal.
+        opaque: smallest alpha of a rendered normal.
+        agreement: smallest cosine between the rendered normal and the normal of the depth.
     """
 
     samples = 400
@@ -108,12 +114,12 @@ class EvidenceLimits:
 
 @dataclass(frozen=True, eq=False)
 class ViewSurface:
-    """The surface that one view sees.
+    """Surface in one view.
 
     Attributes:
-        camera: at the size of the maps.
+        camera: camera at the size of the maps.
         normal: unit normals in camera axes that face the camera, [H, W, 3]. depth: camera z, [H, W].
-        known: whether normal and depth are reliable, [H, W] bool.
+        known: mask of reliable normals and depths, [H, W] bool.
     """
 
     camera: Camera
@@ -128,7 +134,7 @@ class SurfaceSamples:
 
     Attributes:
         aolp, dolp: measured, [N]. noise: standard deviation of the DoLP, [N].
-        azimuth, zenith: angles of the normal in radians, [N]. position: in the world, [N, 3].
+        azimuth, zenith: angles of the normal in radians, [N]. position: position in the world, [N, 3].
     """
 
     aolp: Tensor
@@ -139,7 +145,7 @@ class SurfaceSamples:
     position: Tensor = field(kw_only=True)
 
     def certainly_specular(self, index: float) -> Tensor:
-        """Return true where the DoLP exceeds that of diffuse light at this zenith, [N] bool."""
+        """Return True for pixels whose DoLP exceeds that of diffuse light at their zenith, [N] bool."""
         most = optics.diffuse_dolp((self.zenith + EvidenceLimits.zenith_margin).clamp(max=math.pi / 2), index)
         return self.dolp > most + 2 * self.noise
 
@@ -156,7 +162,7 @@ def sample_surfaces(pairs: Iterable[tuple[InspectedView, ViewSurface]], pairing:
 
     Args:
         pairs: views and their surfaces, whose maps may be smaller than the pictures.
-        pairing: the pairs of perpendicular pictures, an index into ``PAIRINGS``.
+        pairing: pairing of the pictures, an index into ``PAIRINGS``.
     """
     generator = torch.Generator().manual_seed(0)
     samples: list[Tensor] = []
@@ -183,12 +189,12 @@ def sample_surfaces(pairs: Iterable[tuple[InspectedView, ViewSurface]], pairing:
 
 
 def normal_evidence(pixels: SurfaceSamples, index: float) -> OrderEvidence:
-    """Log-likelihoods of all zeros and both senses, given the normals.
+    """Return log-likelihoods of all zeros and both senses, given the normals.
 
     Twice a pixel's angle between AoLP and azimuth follows a mixture: a von Mises distribution about the perpendicular,
     one about the parallel, and a uniform one. The first two have equal weights; for certainly specular pixels the first
     has nearly all. Their width follows from the error of the normals over the sine of the zenith and from the noise of
-    the AoLP; that error and the uniform share are fitted by maximum likelihood.
+    the AoLP. That error and the uniform share are fitted by maximum likelihood.
     """
     count = len(pixels.aolp)
     fewest = EvidenceLimits.fewest_pixels
@@ -197,19 +203,19 @@ def normal_evidence(pixels: SurfaceSamples, index: float) -> OrderEvidence:
             f"Only {count} pixels have a reliable normal and significant polarization; {fewest} are needed."
         )
         return OrderEvidence(NORMALS, torch.zeros(1, len(SENSES), DEGREES), count, False, note)
-    must = pixels.certainly_specular(index)
+    specular = pixels.certainly_specular(index)
     coarse = torch.arange(0, DEGREES, 4)
     fits = [
-        (float(_log_likelihood(pixels, must, coarse, error, inliers).sum(dim=0).max()), error, inliers)
+        (float(_log_likelihood(pixels, specular, coarse, error, inliers).sum(dim=0).max()), error, inliers)
         for error in EvidenceLimits.normal_errors
         for inliers in EvidenceLimits.inliers
     ]
     _, error, inliers = max(fits)
-    values = _log_likelihood(pixels, must, torch.arange(DEGREES), error, inliers)
+    values = _log_likelihood(pixels, specular, torch.arange(DEGREES), error, inliers)
     coherent = _concentration(pixels)
     note = (
-        f"{count} pixels, {int(must.sum())} of which are certainly specular; the AoLP of {inliers:.0%} agrees with the "
-        f"normals, whose error is about {math.degrees(error):.0f}° (agreement modulo 90°: {coherent:.2f} of 1)."
+        f"{count} pixels, {int(specular.sum())} of which are certainly specular. The AoLP of {inliers:.0%} agrees with "
+        f"the normals, whose error is about {math.degrees(error):.0f}° (agreement modulo 90°: {coherent:.2f} of 1)."
     )
     usable = (
         inliers >= EvidenceLimits.least_inliers
@@ -220,20 +226,20 @@ def normal_evidence(pixels: SurfaceSamples, index: float) -> OrderEvidence:
 
 
 def _concentration(pixels: SurfaceSamples) -> float:
-    """Agreement of AoLP and azimuth modulo 90 degrees, for the better sense and the best zero, in [0, 1]."""
+    """Return the agreement of AoLP and azimuth modulo 90 degrees, for the better sense and the best zero, in [0, 1]."""
     angles = 4 * (_SENSES * pixels.aolp - pixels.azimuth)
     return float(torch.hypot(torch.cos(angles).mean(dim=1), torch.sin(angles).mean(dim=1)).max())
 
 
 def _log_likelihood(
-    pixels: SurfaceSamples, must: Tensor, zeros: Tensor, error: float, inliers: float
+    pixels: SurfaceSamples, specular: Tensor, zeros: Tensor, error: float, inliers: float
 ) -> Tensor:
-    """Log-density of the pixels' angles for both senses and zeros [Z] in degrees, [N, 2, Z]."""
+    """Return the log-density of the pixels' angles for both senses and zeros [Z] in degrees, [N, 2, Z]."""
     aolp_noise = pixels.noise / (2 * pixels.dolp)
     variance = (error / torch.sin(pixels.zenith)) ** 2 + aolp_noise**2
     concentration = (1 / (4 * variance)).clamp(max=200.0)[:, None, None]
     height = 1 / (math.pi * torch.special.i0e(concentration))
-    across = torch.where(must, EvidenceLimits.specular, 0.5)[:, None, None]
+    across = torch.where(specular, EvidenceLimits.specular, 0.5)[:, None, None]
     doubled = 2 * (_SENSES * pixels.aolp - pixels.azimuth).T
     cosine = torch.cos(doubled[:, :, None] + torch.deg2rad(2 * zeros.float()))
     lobes = across * torch.exp(-concentration * (1 + cosine))
@@ -244,16 +250,16 @@ def _log_likelihood(
 def point_evidence(
     views: tuple[InspectedView, ...], model: ColmapModel, index: float, pairing: int = 0
 ) -> tuple[OrderEvidence, SurfaceSamples | None]:
-    """Log-likelihoods of all zeros and both senses, given the points of a COLMAP model.
+    """Return log-likelihoods of all zeros and both senses, given the points of a COLMAP model.
 
     Args:
-        views: the views with a pose.
+        views: views with a pose.
         model: points and their observations.
         index: refractive index.
-        pairing: the pairs of perpendicular pictures, an index into ``PAIRINGS``.
+        pairing: pairing of the pictures, an index into ``PAIRINGS``.
 
     Returns:
-        The evidence; and, if it is usable, the observations with the normals found at the best zero.
+        The evidence; and, if it is usable, the observations with the normals at the best zero.
     """
     observations = model.observations([view.name for view in views])
     fields, weights, degrees = _observed_fields(views, model.points.double(), observations, index, pairing)
@@ -277,7 +283,7 @@ def point_evidence(
     sense, zero = divmod(int(total.argmax()), DEGREES)
     misfit = math.degrees(math.asin(min(1.0, float(spreads[sense, :, zero].median().sqrt()))))
     note = (
-        f"{int(keep.sum())} points with {count} observations above the diffuse limit; at the best zero their fields "
+        f"{int(keep.sum())} points with {count} observations above the diffuse limit. At the best zero, their fields "
         f"lie within {misfit:.1f}° of a plane (median)."
     )
     clusters = sum_by_cluster(likelihood.movedim(1, 0), spatial_cells(points))
@@ -285,35 +291,39 @@ def point_evidence(
     evidence = OrderEvidence(POINTS, clusters.float(), count, usable, note)
     if not usable:
         return evidence, None
-    return evidence, _seen_pixels(
+    return evidence, _point_samples(
         fields[sense][keep].double(), weights, degrees[keep].unbind(-1), points, zero
     )
 
 
-def _seen_pixels(
+def _point_samples(
     fields: Tensor, weights: Tensor, degrees: tuple[Tensor, ...], points: Tensor, zero: int
 ) -> SurfaceSamples:
-    """Observations as samples: their DoLP, and the zenith of the normal perpendicular to the fields of their point."""
+    """Return observations as samples, with the zenith of the normal perpendicular to the fields of their point."""
     e, p = fields.unbind(dim=2)
-    turned = math.cos(math.radians(zero)) * e + math.sin(math.radians(zero)) * p
-    moment = torch.einsum("pv,pvi,pvj->pij", weights, turned, turned)
+    rotated = math.cos(math.radians(zero)) * e + math.sin(math.radians(zero)) * p
+    moment = torch.einsum("pv,pvi,pvj->pij", weights, rotated, rotated)
     normals = torch.linalg.eigh(moment)[1][:, :, 0]
     across = math.cos(math.radians(zero)) * p - math.sin(math.radians(zero)) * e
     # The ray is perpendicular to both axes; the normal's component along the second is the sine of the zenith.
     sine = dot(across, normals[:, None].expand_as(across)).abs().clamp(max=1)
     good = weights > 0
     zenith = torch.asin(sine)[good].float()
-    nothing = torch.zeros_like(zenith)
+    zero_angle = torch.zeros_like(zenith)
+    position = points[good.nonzero()[:, 0]]
     return SurfaceSamples(
-        nothing, degrees[0][good], degrees[1][good], nothing, zenith, position=points[good.nonzero()[:, 0]]
+        zero_angle, degrees[0][good], degrees[1][good], zero_angle, zenith, position=position
     )
 
 
 def _observed_fields(
     views: tuple[InspectedView, ...], points: Tensor, visible: Tensor, index: float, pairing: int
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Fields in the world and the axes perpendicular to field and ray, [2, P, V, 2, 3]; weights [P, V]; DoLP and its
-    noise [P, V, 2].
+    """Return fields and polarization of points in views.
+
+    Returns:
+        Fields in the world and the axes perpendicular to field and ray, [2, P, V, 2, 3]; weights [P, V]; DoLP and its
+        noise [P, V, 2].
     """
     limit = float(optics.diffuse_dolp_limit(index))
     fields = torch.zeros(len(SENSES), len(points), len(views), 2, 3)
@@ -335,8 +345,8 @@ def _observed_fields(
         degrees[:, column] = torch.stack((degree, spread), dim=-1)
         certain = degree > limit + 3 * spread
         good = visible[:, column] & inside & certain & (planes[4] < 1e-3) & (stokes[0] > 0.02)
-        # Light that was polarized before the reflection turns the field by about sqrt(1 - d^2) / d times its DoLP,
-        # alike in many observations: hence the square of the inverse variance that this suggests.
+        # Polarization before the reflection rotates the field by about sqrt(1 - d^2) / d times its DoLP, equally in
+        # many observations. The weight is therefore the square of the inverse variance.
         weights[:, column] = good * (degree**2 / (1.05 - degree**2)) ** 2
         x_ref, up_ref = optics.lens_frame(unit(local).float())
         turn = camera.rotation.float()
@@ -349,7 +359,7 @@ def _observed_fields(
 
 
 def _spread(fields: Tensor, weights: Tensor) -> Tensor:
-    """Weighted mean square of the fields' components along the best normal for every zero, [P, 180].
+    """Return the weighted mean square of the fields' components along the best normal for every zero, [P, 180].
 
     A field rotated by z is ``cos z e + sin z p``, so the moments of all zeros follow from three moments.
     """
@@ -366,15 +376,16 @@ def _spread(fields: Tensor, weights: Tensor) -> Tensor:
     return torch.stack(spreads, dim=1)
 
 
-RECIPE = "3dgs-dr:consistent"
+NORMALS_RECIPE = "3dgs-dr:consistent"
+"""Recipe of the short training for normals."""
 LONGEST = 160
-"""Pixels of the longer side that the training's pictures are averaged down to (by a whole factor)."""
+"""Longer side in pixels of the training's pictures after averaging by a whole factor."""
 KEY = "short_run.json"
 SAVE_EVERY = 100
 
 
 def photograph_digest(scene: Scene) -> str:
-    """SHA-256 of what the short training of an inspection reads: photographs, camera poses and points.
+    """Return the SHA-256 of the input of the short training: photographs, camera poses and points.
 
     The order of the four pictures of a view does not affect the digest.
     """
@@ -403,22 +414,18 @@ def short_run(
     """Run or resume the short training, or load its finished state.
 
     Args:
-        scene: at the size to train at.
-        folder: where its state is kept; one of another scene or length is replaced.
+        scene: scene at the size of the training.
+        folder: folder of its state; the state of another scene or length is replaced.
         steps: optimizer steps.
         backend: device and rasterizer.
-        on_step: called after every step.
-        refractive_index: refractive index of the surfaces; None: that of the scene.
-        recipe: what trains; None: ``RECIPE``.
-        until: the step to stop after; 0: the last.
+        on_step: function called after every step.
+        refractive_index: refractive index of the surfaces; None for that of the scene.
+        recipe: recipe of the training; None for ``NORMALS_RECIPE``.
+        until: step to stop after; 0 for the last.
     """
-    if recipe is None:
-        named = recipe_named(RECIPE)
-        assert isinstance(named, Recipe)
-        recipe = named
-    specified = TrainSettings(steps, 0, refractive_index, begin_again=False)
-    settings = resolve(specified, scene, recipe)
-    wanted = {
+    recipe = recipe or training_recipe(NORMALS_RECIPE)
+    settings = resolve(TrainSettings(steps, 0, refractive_index, begin_again=False), scene, recipe)
+    key = {
         "photographs": photograph_digest(scene),
         "steps": steps,
         "recipe": recipe.name,
@@ -426,12 +433,12 @@ def short_run(
         "version": __version__,
     }
     until = until or steps
-    state = load_checkpoint(folder, recipe, backend.device) if _same(folder, wanted) else None
+    state = load_checkpoint(folder, recipe, backend.device) if _is_state_of(folder, key) else None
     loop, _ = gaussian_training(TrainingContext(scene, recipe, settings, backend), state)
     if state is None:
         folder.mkdir(parents=True, exist_ok=True)
         (folder / CHECKPOINT).unlink(missing_ok=True)
-        write_text(folder / KEY, json.dumps(wanted))
+        write_text(folder / KEY, json.dumps(key))
     try:
         while loop.state.step < until:
             on_step(loop.step())
@@ -444,10 +451,10 @@ def short_run(
     return loop.state
 
 
-def _same(folder: Path, wanted: dict[str, object]) -> bool:
-    """Return true if the folder holds a readable state of the same training."""
+def _is_state_of(folder: Path, key: dict[str, object]) -> bool:
+    """Return True if the folder contains a readable state of the same training."""
     try:
-        return read_record(folder / KEY, dict[str, Any]) == wanted and (folder / CHECKPOINT).exists()
+        return read_record(folder / KEY, dict[str, Any]) == key and (folder / CHECKPOINT).exists()
     except PolarguideError:
         return False
 

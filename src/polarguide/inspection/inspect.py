@@ -1,6 +1,6 @@
-"""``inspect_scene``: reads a capture, runs every check it can carry, and puts the findings together.
+"""Inspection of a scene: reading, all applicable checks, and the checks of poses.
 
-The checks of poses are here: epipolar errors, and gaps in the coverage.
+The checks of poses measure epipolar errors and gaps in the coverage.
 """
 
 from __future__ import annotations
@@ -67,18 +67,18 @@ class PoseLimits:
     """Constants of the checks of poses, and of the decision to train.
 
     Attributes:
-        neighbors: views that a view is matched with.
-        features: most features of a view.
-        fewest_matches: matches from which on two views are compared.
+        neighbors: number of views that each view is matched with.
+        features: largest number of features of a view.
+        fewest_matches: smallest number of matches for a comparison of two views.
         ratio: largest distance of a match's descriptors over that of the second best match.
-        gate: share of the picture's diagonal; matches farther from their epipolar line count as mismatches.
+        gate: share of the picture's diagonal; matches farther from their epipolar line are mismatches.
         typical_px: median epipolar error in stored pixels above which a capture gets a warning.
         view_px: the same of one view.
-        stands_out: times the median view's error that a view also has to exceed.
-        gap: degrees to the nearest view above which a view is lonely.
-        few_views: views below which a capture gets a warning.
-        sure: probability of an order from which on ``auto`` does not train.
-        fewest_to_train: views with a pose from which on a short training is possible.
+        stands_out: smallest ratio of a bad view's error to that of the median view.
+        gap: degrees to the nearest view above which a view is isolated.
+        few_views: number of views below which a capture gets a warning.
+        sure: probability of an order above which ``auto`` does not train.
+        fewest_to_train: smallest number of views with a pose for a short training.
     """
 
     neighbors = 4
@@ -106,18 +106,17 @@ class PairError:
 
 
 def epipolar_errors(capture: Capture) -> list[PairError]:
-    """Match every posed view with its nearest neighbors in position and viewing direction."""
-    views = capture.posed
-    features = [_features(view) for view in views]
+    """Match every view with a pose with its nearest neighbors in position and viewing direction."""
+    views = [(view.name, camera, *_features(view)) for view, camera in capture.cameras]
     errors = (
-        _pair_error(views[i], views[j], features[i], features[j], capture.factor)
-        for i, j in _neighbor_pairs([view.camera for view in views if view.camera is not None])
+        _pair_error(views[i], views[j], capture.factor)
+        for i, j in _neighbor_pairs([camera for _, camera in capture.cameras])
     )
     return [error for error in errors if error is not None]
 
 
 def view_errors(errors: Sequence[PairError]) -> dict[str, float]:
-    """Each view's error: the lower quartile over its pairs, so that one bad view does not affect its neighbors."""
+    """Return the lower quartile of the errors of each view's pairs, which excludes the effect of a bad neighbor."""
     by_view: dict[str, list[float]] = {}
     for pair in errors:
         for name in (pair.first, pair.second):
@@ -148,46 +147,41 @@ def _neighbor_pairs(cameras: Sequence[Camera]) -> list[tuple[int, int]]:
     return sorted({(min(i, int(j)), max(i, int(j))) for i, row in enumerate(near) for j in row})
 
 
-def _pair_error(
-    first: InspectedView,
-    second: InspectedView,
-    features1: tuple[NDArray[np.float64], NDArray[np.float32] | None],
-    features2: tuple[NDArray[np.float64], NDArray[np.float32] | None],
-    factor: int,
-) -> PairError | None:
-    x1, d1 = features1
-    x2, d2 = features2
-    assert first.camera is not None
-    assert second.camera is not None
+_Features = tuple[str, Camera, NDArray[np.float64], NDArray[np.float32] | None]
+"""Name, camera, and positions [N, 2] and descriptors [N, 128] of features of a view."""
+
+
+def _pair_error(first: _Features, second: _Features, factor: int) -> PairError | None:
+    name1, camera1, x1, d1 = first
+    name2, camera2, x2, d2 = second
     if d1 is None or d2 is None or min(len(d1), len(d2)) < 2:
         return None
     matcher = cv2.BFMatcher(cv2.NORM_L2)
-    there = matcher.knnMatch(d1, d2, k=2)
-    back = {m.queryIdx: m.trainIdx for m in matcher.match(d2, d1)}
+    backward = {m.queryIdx: m.trainIdx for m in matcher.match(d2, d1)}
     matches = [
         m
-        for m, n in there
-        if m.distance < PoseLimits.ratio * n.distance and back.get(m.trainIdx) == m.queryIdx
+        for m, n in matcher.knnMatch(d1, d2, k=2)
+        if m.distance < PoseLimits.ratio * n.distance and backward.get(m.trainIdx) == m.queryIdx
     ]
     if len(matches) < PoseLimits.fewest_matches:
         return None
     p1 = np.concatenate([x1[[m.queryIdx for m in matches]], np.ones((len(matches), 1))], axis=1)
     p2 = np.concatenate([x2[[m.trainIdx for m in matches]], np.ones((len(matches), 1))], axis=1)
-    matrix = _fundamental(first.camera, second.camera)
+    matrix = _fundamental(camera1, camera2)
     along2 = p1 @ matrix.T
     along1 = p2 @ matrix
     value = np.abs((p2 * along2).sum(axis=1))
     length = np.sqrt((along1[:, :2] ** 2).sum(1) + (along2[:, :2] ** 2).sum(1))
-    nowhere = np.full_like(value, np.inf)  # cameras in one place have no epipolar lines
-    distance = np.divide(value, length, out=nowhere, where=length > 0) * np.sqrt(2)
-    near = distance < PoseLimits.gate * float(np.hypot(first.camera.width, first.camera.height))
+    infinite = np.full_like(value, np.inf)  # cameras at one place have no epipolar lines
+    distance = np.divide(value, length, out=infinite, where=length > 0) * np.sqrt(2)
+    near = distance < PoseLimits.gate * float(np.hypot(camera1.width, camera1.height))
     if near.sum() < PoseLimits.fewest_matches:
         return None
-    return PairError(first.name, second.name, int(near.sum()), float(np.median(distance[near])) * factor)
+    return PairError(name1, name2, int(near.sum()), float(np.median(distance[near])) * factor)
 
 
 def _fundamental(first: Camera, second: Camera) -> NDArray[np.float64]:
-    """F with ``x2^T F x1 = 0`` for pixels of the two views (Hartley and Zisserman, Eq. 9.2)."""
+    """Return F with ``x2^T F x1 = 0`` for pixels of the two views (Hartley and Zisserman, Eq. 9.2)."""
     rotation = (second.rotation @ first.rotation.T).numpy()
     x, y, z = second.translation.numpy() - rotation @ first.translation.numpy()
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
@@ -196,7 +190,7 @@ def _fundamental(first: Camera, second: Camera) -> NDArray[np.float64]:
 
 
 def pose_check(capture: Capture) -> Check:
-    """Check whether feature matches agree with the poses."""
+    """Check if feature matches agree with the poses."""
     if capture.model is None:
         remedy = "Run polarguide prepare with --poses sfm or --poses PATH."
         return Check("poses", "n/a", "There are no poses.", remedy)
@@ -216,8 +210,8 @@ def pose_check(capture: Capture) -> Check:
     verdict: Verdict = "warning" if bad or missing else "ok"
     remedies = []
     if bad:
-        finding += f" Far worse: {listed([f'{name} ({errors[name]:.1f} px)' for name in bad])}."
-        remedies.append("Leave these views out, or register them again.")
+        finding += f" Much worse: {listed([f'{name} ({errors[name]:.1f} px)' for name in bad])}."
+        remedies.append("Remove these views, or register them again.")
     if missing:
         finding += f" Without a pose: {len(missing)} views ({listed(list(missing))})."
         remedies.append("Remove the pictures of views without a pose, which train refuses, or register them.")
@@ -229,8 +223,8 @@ def pose_check(capture: Capture) -> Check:
 
 
 def coverage_check(capture: Capture) -> Check:
-    """Check whether neighboring views are close enough to each other."""
-    cameras = [view.camera for view in capture.posed if view.camera is not None]
+    """Check if neighboring views are close enough to each other."""
+    cameras = [camera for _, camera in capture.cameras]
     if len(cameras) < 2:
         return Check("coverage", "n/a", "Fewer than two views have a pose.")
     focus = scene_frame(cameras).center
@@ -247,9 +241,9 @@ def coverage_check(capture: Capture) -> Check:
         f"(median; at most {nearest.max():.0f}°), "
         f"within {spread:.0f}° of their mean direction."
     )
-    lonely = tuple(v.name for v, gap in zip(capture.posed, nearest, strict=True) if gap > PoseLimits.gap)
+    isolated = tuple(v.name for v, gap in zip(capture.posed, nearest, strict=True) if gap > PoseLimits.gap)
     outcome = first_outcome(
-        (not lonely and len(directions) >= PoseLimits.few_views, "ok", finding, ""),
+        (not isolated and len(directions) >= PoseLimits.few_views, "ok", finding, ""),
         (
             True,
             "warning",
@@ -257,17 +251,17 @@ def coverage_check(capture: Capture) -> Check:
             "Reconstruction is unreliable across gaps: add views at most 15 degrees apart.",
         ),
     )
-    return Check("coverage", *outcome, lonely, figures)
+    return Check("coverage", *outcome, isolated, figures)
 
 
 @dataclass(frozen=True, eq=False)
 class Inspection:
-    """The findings.
+    """Findings of an inspection.
 
     Attributes:
-        capture: what was inspected. settings: how. index: the refractive index that was used.
-        measurements: measurements of each view. checks: in the order in which they are shown.
-        angles: order, sense and zero; of a capture with other pictures, what each tells of its polarizer.
+        capture: the capture. settings: settings of the inspection. index: refractive index that was used.
+        measurements: measurements of each view. checks: checks in the order of the page.
+        angles: order, sense and zero; for other pictures, the estimates of their polarizers.
     """
 
     capture: Capture
@@ -279,7 +273,7 @@ class Inspection:
 
     @property
     def verdict(self) -> Verdict:
-        """The worst of all checks."""
+        """The worst verdict of all checks."""
         return worst(self.checks)
 
     def check(self, key: str) -> Check:
@@ -288,10 +282,10 @@ class Inspection:
 
 
 def inspection_folder(scene: Path, out: Path | None = None) -> Path:
-    """The folder that an inspection writes: ``out``, or SCENE-inspection beside the scene.
+    """Return the folder of an inspection: ``out``, or SCENE-inspection next to the scene.
 
     Raises:
-        PolarguideError: there is a file of this name, or it would be written into a scene.
+        PolarguideError: a file has this name, or the folder is inside a scene.
     """
     beside = scene.resolve().with_name(scene.resolve().name + "-inspection")
     folder = beside if out is None else out
@@ -308,9 +302,9 @@ def inspect_scene(
 
     Args:
         path: the scene; it may have no poses.
-        out: folder for what is kept of a short training.
-        settings: the user's choices.
-        backend: what the short training runs on.
+        out: folder of the state of a short training.
+        settings: settings of the inspection.
+        backend: device and rasterizer of the short training.
         reporter: receives the progress.
 
     Raises:
@@ -323,7 +317,7 @@ def inspect_scene(
             "--calibration",
             expected="a scene with four pictures of each view",
             found="a scene with pictures at other angles",
-            remedy="Leave --calibration out.",
+            remedy="Omit --calibration.",
         )
     if settings.calibration is not None:
         capture = corrected(capture, settings.calibration)
@@ -364,9 +358,9 @@ def _shots(
         checks += [pose_check(capture), lens_check(capture), coverage_check(capture)]
     needed = "The angles are checked by a short training, which"
     if len(capture.posed) < PoseLimits.fewest_to_train:
-        findings = ShotFindings(why=f"{needed} takes {PoseLimits.fewest_to_train} views with a pose.")
+        findings = ShotFindings(why=f"{needed} needs {PoseLimits.fewest_to_train} views with a pose.")
     elif settings.normals == "points":
-        findings = ShotFindings(why=f"{needed} --normals points leaves out.")
+        findings = ShotFindings(why=f"{needed} --normals points disables.")
     else:
         scene = _training_scene(capture, settings, reporter, held_out=())
         with reporter.track("short training", settings.steps) as advance:
@@ -390,12 +384,12 @@ def _angles(
     backend: Backend,
     reporter: Reporter,
 ) -> tuple[AngleFindings, SurfaceSamples | None]:
-    """Return order, sense and zero by the available geometry; and the pixels with normals if there are any."""
+    """Return order, sense and zero by the available geometry, and pixels with normals if there are any."""
     sources: list[OrderEvidence] = []
     pixels = None
     trains = settings.normals != "points" and len(capture.posed) >= PoseLimits.fewest_to_train
     if capture.model is not None and len(capture.posed) >= 2:
-        with reporter.track("weighing points", 1):
+        with reporter.track("evaluating points", 1):
             evidence, pixels = point_evidence(capture.posed, capture.model, index, pairing)
         sources.append(evidence)
         if settings.normals == "auto" and evidence.usable:
@@ -438,7 +432,12 @@ def _trained_pixels(
 def _training_scene(
     capture: Capture, settings: InspectSettings, reporter: Reporter, held_out: Sequence[str] | None = None
 ) -> Scene:
-    """The views with a pose at the size of a short training; ``held_out``: those to leave out, None: as ever."""
+    """Load the views with a pose at the size of a short training.
+
+    Args:
+        capture: the capture. settings: settings of the inspection. reporter: receives the progress.
+        held_out: names of held-out views; None for the default.
+    """
     factor = max(1, math.ceil(max(capture.size) / LONGEST))
     names = [view.name for view in capture.posed]
     scene = load_scene(

@@ -13,7 +13,7 @@ import torch
 
 from polarguide import optics
 from polarguide.capture import checks
-from polarguide.capture.angle_evidence import PAIRINGS, swaps
+from polarguide.capture.angle_evidence import PAIRINGS, AngleLimits, decide_pairing, swaps
 from polarguide.capture.checks import MeasuredGains, measured_gains, pair_moments
 from polarguide.capture.view import ANGLES, FULL_CODE, listed
 from polarguide.inspection.angles import AngleFindings
@@ -28,20 +28,20 @@ class PictureLimits:
     Attributes:
         pair_error: median |I0 + I90 - I45 - I135| / S0 of a view above which its four pictures are inconsistent.
         unequal: deviation of the pair ratio from 1 for a warning; real sensors have about 0.02.
-        very_unequal: the same for the verdict "wrong"; a picture that is exposed 5 % longer gives 0.025.
-        exposed_unequal: largest difference of the logarithms of the gains of two angles for a warning; angles marked to
-            two degrees leave 0.07, real sensors 0.04.
+        very_unequal: the same for the verdict "wrong"; a picture with 5 % more exposure gives 0.025.
+        exposed_unequal: largest difference of the logarithms of the gains of two angles without a warning; angles set
+            to two degrees give 0.07, real sensors 0.04.
         exposed_very_unequal: the same for the verdict "wrong"; a third of a stop gives 0.23.
         unsteady: deviation of a view's pair ratio from the capture's.
-        saturated: share of saturated pixels from which on a view gets a warning.
-        blown: share of saturated pixels from which on a capture is wrong.
+        saturated: share of saturated pixels above which a view gets a warning.
+        blown: share of saturated pixels above which a capture is wrong.
         little: share of polarized pixels below which a capture gets a warning.
         almost_none: share of polarized pixels below which a capture is wrong.
         noisy: noise of one intensity as a share of S0 / 2; three times its DoLP noise is then 0.13.
-        underexposed: 99th percentile of the values below which the exposure of a view was too short.
-        bent: curvature of the response for the verdict "wrong", beside ``checks.BENT``. A gamma of 0.8 has -0.125, of
-            0.73 -0.18; DoLP is then off by as much as the gamma. Smooth areas of a real sensor's pictures have -0.17.
-        sure_bend: standard errors by which a curvature differs from 0 for certain.
+        underexposed: 99th percentile of the values below which a view is underexposed.
+        bent: curvature of the response for the verdict "wrong" if it is significant. A gamma of 0.8 has -0.125, of 0.73
+            -0.18; DoLP has a similar error. Smooth areas of a real sensor's pictures have -0.17.
+        sure_bend: standard errors of a significant curvature. See ``AngleLimits.sure``.
         not_dielectric: share of the pixels with normals, or of all pixels, above which the check warns.
     """
 
@@ -63,28 +63,20 @@ class PictureLimits:
 
 
 def find_pairing(capture: Capture) -> int | None:
-    """Return the pairing with the best pair sums, an index into ``PAIRINGS``; None if they do not decide."""
+    """Return the pairing by the pair sums, an index into ``PAIRINGS``; None if they do not decide."""
     residuals = np.array(
         [checks.measure(view.codes.numpy(), view.usable.numpy()).residuals for view in capture.views]
     )
-    residuals = residuals[residuals.max(axis=1) > 0]
-    if len(residuals) == 0:
-        return None
-    exposed = measured_exposures(capture)
-    if (
-        exposed is not None
-        and exposed.pairing is not None
-        and max(exposed.errors) < PictureLimits.exposed_unequal / 3
-    ):
-        return exposed.pairing  # whatever the exposures are
-    medians = np.median(residuals, axis=0)
-    best = int(medians.argmin())
-    others = np.delete(medians, best)
-    return best if medians[best] < 0.5 * float(others.min()) else None
+    gains = measured_exposures(capture) if residuals.any() else None
+    if gains is not None and gains.pairing is not None:
+        precise = AngleLimits.sure * max(gains.errors) < PictureLimits.exposed_unequal
+        if precise:  # exposures may differ
+            return gains.pairing
+    return decide_pairing(residuals)
 
 
 def measured_exposures(capture: Capture) -> MeasuredGains | None:
-    """The exposures of the four angles by the pair sums of all views; None where they are too dark."""
+    """Return the exposures of the four angles by the pair sums of all views; None if they are too dark."""
     moments = [
         pair_moments(view.intensities().mean(dim=-1).numpy(), view.usable.numpy()) for view in capture.views
     ]
@@ -94,7 +86,7 @@ def measured_exposures(capture: Capture) -> MeasuredGains | None:
 def picture_checks(
     capture: Capture, measurements: Sequence[ViewMeasurements], pairing: int | None
 ) -> list[Check]:
-    """All checks of this file, in their order on the page."""
+    """Return all checks of four angles, in their order on the page."""
     if capture.origin == "stokes":
         computed = "The four pictures were computed from Stokes vectors: their sums agree by construction."
         return [
@@ -104,7 +96,7 @@ def picture_checks(
             _polarization(measurements),
         ]
     encoding = _encoding(capture, pairing)
-    # A bent response looks like exposures that differ.
+    # A nonlinear response looks like different exposures.
     exposed = measured_exposures(capture) if encoding.verdict == "ok" else None
     return [
         _pairs(measurements, pairing),
@@ -117,7 +109,7 @@ def picture_checks(
 
 
 def light_checks(capture: Capture, measurements: Sequence[ViewMeasurements]) -> list[Check]:
-    """The checks that apply to pictures at any angles: saturation and brightness."""
+    """Return the checks for pictures at any angles: saturation and brightness."""
     return [_saturation(capture, measurements), _brightness(measurements)]
 
 
@@ -134,7 +126,7 @@ def _pairs(measurements: Sequence[ViewMeasurements], pairing: int | None) -> Che
             pairing,
             "wrong",
             f"The pair sums agree only if {swaps(PAIRINGS[pairing or 0])}.",
-            "Rename the files; once the whole order is decided, --fix does it.",
+            "Rename the files. --fix renames them once the order is decided.",
         ),
         (not off, "ok", f"I0 + I90 and I45 + I135 differ by {error:.1%} of S0 (median).", ""),
         (
@@ -142,7 +134,7 @@ def _pairs(measurements: Sequence[ViewMeasurements], pairing: int | None) -> Che
             _majority(off, measurements),
             f"I0 + I90 and I45 + I135 differ by more than {PictureLimits.pair_error:.0%} of S0 in {len(off)} views "
             f"({listed(list(off))}).",
-            "Check whether something moved or the light changed between the shots, or whether files were exchanged.",
+            "Check for motion or light changes between the shots, and for exchanged files.",
         ),
     )
     figures = {"median_error": error, "pairing": None if pairing is None else list(PAIRINGS[pairing])}
@@ -154,35 +146,35 @@ def _encoding(capture: Capture, pairing: int | None) -> Check:
         checks.pair_slopes(view.codes.numpy(), view.usable.numpy(), checks.FOUR_PAIRS)
         for view in capture.views
     ]
-    found = checks.curvature_of(list(itertools.chain.from_iterable(slopes)))
-    if found is None or pairing not in (None, 0):
-        why = "too few pixels are polarized" if found is None else "the pictures are paired wrongly"
-        return Check("encoding", "n/a", f"The curvature of the response cannot be measured: {why}.")
-    curvature = found.value
-    bend = abs(curvature)
-    sure = bend > PictureLimits.sure_bend * found.error
-    doubtful, certain = np.abs(checks.ENCODED if curvature < 0 else checks.DECODED)
+    curvature = checks.curvature_of(list(itertools.chain.from_iterable(slopes)))
+    if curvature is None or pairing not in (None, 0):
+        reason = "too few pixels are polarized" if curvature is None else "the pictures are paired wrongly"
+        return Check("encoding", "n/a", f"The curvature of the response cannot be measured: {reason}.")
+    bend = abs(curvature.value)
+    sure = bend > PictureLimits.sure_bend * curvature.error
+    doubtful, certain = np.abs(checks.ENCODED if curvature.value < 0 else checks.DECODED)
     finding = (
-        f"Curvature of the response {curvature:+.2f}; linear files have 0, sRGB read as linear about -0.6."
+        f"The curvature of the response is {curvature.value:+.2f}; linear files have 0, sRGB about -0.6."
     )
     verdict: Verdict = "wrong" if bend > certain or (sure and bend > PictureLimits.bent) else "warning"
     outcome = first_outcome(
         (bend <= doubtful and not (sure and bend > checks.BENT), "ok", finding, ""),
         (
-            curvature < 0,
+            curvature.value < 0,
             verdict,
             finding,
-            "The files seem display-encoded (gamma): export linear ones, or read them with --transfer srgb; mosaics of "
-            f"a camera with gamma are prepared with --gamma (here about {1 / (1 + 2 * bend):.2f}).",
+            "The files seem display-encoded (gamma). Export linear files, or read them with --transfer srgb. Prepare "
+            f"mosaics of a camera with gamma with --gamma (here about {1 / (1 + 2 * bend):.2f}).",
         ),
         (
             True,
             verdict,
             finding,
-            "The files seem linear but are decoded (or have another tone curve): try --transfer linear.",
+            "The files seem linear but are decoded, or have another tone curve: try --transfer linear.",
         ),
     )
-    return Check("encoding", *outcome, figures={"curvature": curvature, "curvature_error": found.error})
+    figures = {"curvature": curvature.value, "curvature_error": curvature.error}
+    return Check("encoding", *outcome, figures=figures)
 
 
 def _exposure(
@@ -192,31 +184,30 @@ def _exposure(
     if not known or pairing not in (None, 0):
         return Check("exposure", "n/a", "The pair sums cannot be compared.")
     ratio = float(np.median(list(known.values())))
-    off = tuple(view for view, of_view in known.items() if abs(of_view - ratio) > PictureLimits.unsteady)
+    off = tuple(view for view, own in known.items() if abs(own - ratio) > PictureLimits.unsteady)
     figures: dict[str, Any] = {"pair_ratio": ratio, "unsteady_views": len(off)}
     finding = f"(I0 + I90) / (I45 + I135) is {ratio:.3f} (median); ideal analyzers have 1."
     verdict: Verdict = "ok"
     remedy = ""
     if abs(ratio - 1) > PictureLimits.unequal:
         verdict = "wrong" if abs(ratio - 1) > PictureLimits.very_unequal else "warning"
-        finding += f" If only one picture deviates, it does by {2 * abs(ratio - 1):.0%}."
+        finding += f" If only one picture deviates, its deviation is {2 * abs(ratio - 1):.0%}."
         remedy = (
-            "Let prepare estimate the gains (it does by default), or measure them on unpolarized light and give "
-            "--calibration. The pair sums do not show which of the four deviates."
+            "Let prepare estimate the gains (the default), or measure them in unpolarized light and use --calibration. "
+            "The pair sums do not show which of the four deviates."
         )
-    if exposed is not None and np.ptp(exposed.logs) > max(
-        PictureLimits.exposed_unequal, 3 * max(exposed.errors)
-    ):
+    spread = 0.0 if exposed is None else float(np.ptp(exposed.logs))
+    error = 0.0 if exposed is None else AngleLimits.sure * max(exposed.errors)
+    if exposed is not None and spread > max(PictureLimits.exposed_unequal, error):
         gains = np.exp(exposed.logs).tolist()
         figures["exposures"] = gains
-        if verdict != "wrong":
-            wrong = np.ptp(exposed.logs) > max(PictureLimits.exposed_very_unequal, 3 * max(exposed.errors))
-            verdict = "wrong" if wrong else "warning"
+        wrong = verdict == "wrong" or spread > max(PictureLimits.exposed_very_unequal, error)
+        verdict = "wrong" if wrong else "warning"
         each = ", ".join(f"{angle}°: {gain:.2f}" for angle, gain in zip(ANGLES, gains, strict=True))
-        finding += f" Pixel by pixel, they agree if the angles were exposed by {each}."
+        finding += f" The sums of all pixels agree if the exposures of the angles are {each}."
         remedy = (
-            "Prepare the original files, whose EXIF says the exposure, with --gains auto; or give gains with "
-            "--calibration. An angle that is off by several degrees looks alike."
+            "Prepare the original files, whose EXIF states the exposure, with --gains auto; or specify gains with "
+            "--calibration. An angle error of several degrees looks the same."
         )
     if off:
         verdict = "warning" if verdict == "ok" else verdict
@@ -227,12 +218,12 @@ def _exposure(
 
 def _saturation(capture: Capture, measurements: Sequence[ViewMeasurements]) -> Check:
     shares = [r.saturated for r in measurements]
-    lost = {r.view: r.saturated + r.invalid for r in measurements}
+    unusable = {r.view: r.saturated + r.invalid for r in measurements}
     invalid = float(np.mean([r.invalid for r in measurements]))
     dark = float(np.mean([r.dark for r in measurements]))
     largest = max(view.peak for view in capture.views)
     unscaled = capture.bits == 16 and 0 < largest < (FULL_CODE + 1) // 16
-    off = () if unscaled else tuple(view for view, share in lost.items() if share > PictureLimits.saturated)
+    off = tuple(view for view, share in unusable.items() if share > PictureLimits.saturated and not unscaled)
     finding = (
         f"{np.mean(shares):.1%} of the pixels are at full scale, at most {max(shares):.1%} in a view; "
         f"{invalid:.1%} are marked invalid, {dark:.1%} are too dark to be used."
@@ -242,15 +233,15 @@ def _saturation(capture: Capture, measurements: Sequence[ViewMeasurements]) -> C
             unscaled,
             "wrong",
             f"No value of the 16-bit files exceeds {largest}.",
-            "The data were not scaled to 16 bits: multiply the values, or run prepare with --bits.",
+            "The data are not scaled to 16 bits. Multiply the values, or run prepare with --bits.",
         ),
         (not off, "ok", finding, ""),
         (
             off,
-            "wrong" if np.mean(list(lost.values())) > PictureLimits.blown else "warning",
-            f"{finding} Over {PictureLimits.saturated:.0%} are lost in {len(off)} views ({listed(list(off))}).",
-            "These pixels carry no polarization and are excluded. Invalid ones may have clipped in the camera: expose "
-            "shorter, keep lamps out of the picture.",
+            "wrong" if np.mean(list(unusable.values())) > PictureLimits.blown else "warning",
+            f"{finding} Over {PictureLimits.saturated:.0%} are unusable in {len(off)} views ({listed(list(off))}).",
+            "These pixels have no polarization and are excluded. Invalid pixels may have clipped in the camera: "
+            "decrease the exposure, and keep lamps out of the picture.",
         ),
     )
     figures = {"saturated": float(np.mean(shares)), "worst": max(shares), "invalid": invalid, "dark": dark}
@@ -266,9 +257,9 @@ def _noise(measurements: Sequence[ViewMeasurements]) -> Check:
         if r.noise_share > PictureLimits.noisy or r.bright < PictureLimits.underexposed
     )
     finding = (
-        f"Noise of one intensity is {share:.2%} of the photograph (median, after averaging down), so that a DoLP "
-        f"of {3 * 2**0.5 * share / 2:.3f} is three times its noise; "
-        f"the 99th percentile of the values is {bright:.0%} of full scale."
+        f"The noise of one intensity is {share:.2%} of the photograph (median, after averaging). A DoLP of "
+        f"{3 * 2**0.5 * share / 2:.3f} is three times its noise. "
+        f"The 99th percentile of the values is {bright:.0%} of full scale."
     )
     outcome = first_outcome(
         (not off, "ok", finding, ""),
@@ -285,8 +276,8 @@ def _noise(measurements: Sequence[ViewMeasurements]) -> Check:
 def with_noise(angles: AngleFindings, measurements: Sequence[ViewMeasurements]) -> AngleFindings:
     """Return the findings with noise in the error of the zero if the check of noise warns.
 
-    There, values are steps of a tone curve or what a compression left of them, which is not independent from pixel to
-    pixel. So the error that it makes in the AoLP of one strongly polarized pixel is that of all of them together.
+    In these captures, steps of a tone curve or compression cause noise that is not independent between pixels. The
+    error of the AoLP of one strongly polarized pixel is then also that of the zero.
     """
     share = float(np.median([r.noise_share for r in measurements]))
     degree = float(np.median([r.dolp[1] for r in measurements]))
@@ -322,18 +313,17 @@ def _polarization(measurements: Sequence[ViewMeasurements]) -> Check:
         (
             (strongest < POLARIZED or share < PictureLimits.almost_none) and noise < POLARIZED,
             "wrong",
-            "No modulation: was the filter reversed, or missing? The four pictures show the same light but for "
-            f"noise; 99 % of the pixels (median view) have a DoLP under {strongest:.3f}, and {share:.1%} one above "
-            "three times their noise.",
+            "No modulation: was the filter reversed, or missing? The four pictures differ only by noise. In the median "
+            f"view, 99 % of the pixels have a DoLP below {strongest:.3f}, and {share:.1%} have one above three times "
+            "its noise.",
             LCD_TEST,
         ),
         (
             True,
             "wrong" if share < PictureLimits.almost_none else "warning",
             finding,
-            "Polarization carries little information here. Photograph surfaces obliquely (50 to 65 degrees), from "
-            "lower views; check that the filter is a linear polarizer, the right way round, and that the exposure was "
-            "fixed.",
+            "The polarization is weak. Photograph surfaces obliquely (50 to 65 degrees), from lower views. Check that "
+            "the filter is a linear polarizer with the right side in front, and that the exposure was fixed.",
         ),
     )
     figures = {"polarized": share, "median_dolp": median, "p99_dolp": strongest}
@@ -343,15 +333,13 @@ def _polarization(measurements: Sequence[ViewMeasurements]) -> Check:
 def dielectric_check(
     measurements: Sequence[ViewMeasurements], pixels: SurfaceSamples | None, index: float
 ) -> Check:
-    """Check whether large areas are polarized more strongly than a dielectric under unpolarized light can be."""
+    """Check if large areas are polarized more strongly than a dielectric under unpolarized light."""
     share = float(torch.tensor([r.above_limit for r in measurements]).median())
     limit = float(optics.diffuse_dolp_limit(index))
     finding = f"{share:.0%} of the pixels (median view) have a DoLP above the diffuse limit ({limit:.2f}). "
     figures = {"above_diffuse_limit": share}
     if pixels is None or len(pixels.aolp) == 0:
-        finding += (
-            "Without normals, reflections of a smooth dielectric cannot be distinguished from metal or sky."
-        )
+        finding += "Without normals, reflections of a smooth dielectric look like metal or sky."
     else:
         share = float(exceeds_dielectric(pixels, index).float().mean())
         figures["unexplained"] = share
@@ -362,15 +350,15 @@ def dielectric_check(
             True,
             "warning",
             finding,
-            "Bare metal, sky or its reflection, or a screen? The model assumes dielectrics under unpolarized light: "
-            "exclude such areas with masks, and expect worse normals there.",
+            "Bare metal, sky or its reflection, or a screen? The model assumes dielectrics under unpolarized light. "
+            "Exclude such areas with masks, or expect worse normals there.",
         ),
     )
     return Check("dielectric", *outcome, figures=figures)
 
 
 def exceeds_dielectric(pixels: SurfaceSamples, index: float) -> torch.Tensor:
-    """Return true where the DoLP exceeds both lobes at every zenith within the margin, [N] bool."""
+    """Return True for pixels whose DoLP exceeds both lobes at every zenith within the margin, [N] bool."""
     steps = EvidenceLimits.zenith_margin * torch.linspace(-1, 1, 7)
     zenith = (pixels.zenith[:, None] + steps).clamp(0, math.pi / 2)
     most = torch.maximum(optics.specular_dolp(zenith, index), optics.diffuse_dolp(zenith, index)).amax(dim=1)

@@ -1,4 +1,4 @@
-"""An inspection as one HTML page without scripts or other files, and as ``inspection.json`` for programs."""
+"""Report of an inspection: an HTML page without scripts or external files, and ``inspection.json`` for programs."""
 
 from __future__ import annotations
 
@@ -18,8 +18,7 @@ from polarguide.inspection.capture import InspectedView, ViewMeasurements, quant
 from polarguide.inspection.inspect import Inspection
 from polarguide.inspection.settings import json_value
 from polarguide.visualization import figures
-from polarguide.visualization.figures import Picture
-from polarguide.visualization.layers import AOLP_FULL_DOLP, DOLP_HIGH
+from polarguide.visualization.figures import AOLP_FULL_DOLP, DOLP_HIGH, Picture
 from polarguide.visualization.pages import data_uri, page
 
 SIDE = 240
@@ -32,11 +31,11 @@ INVALID_COLOR = (60, 120, 255)
 
 @dataclass(frozen=True)
 class Layer:
-    """A layer that the page can show.
+    """A layer of the page.
 
     Attributes:
-        key, label: its name in HTML and for people. legend: a description of its colors.
-        ramp: color map of the legend's bar, or None. caption: the line below a view.
+        key: name in HTML. label: name for readers. legend: description of its colors.
+        ramp: color map of the legend's bar, or None. caption: function that returns the line below a view.
     """
 
     key: str
@@ -54,7 +53,7 @@ LAYERS: tuple[Layer, ...] = (
           lambda r: f"{r.polarized:.0%} polarized"),
     Layer("saturation", "Saturation", "Red: one angle at full scale. Blue: marked invalid, or black.", None,
           lambda r: f"{r.saturated:.1%} + {r.invalid:.1%}"),
-    Layer("noise", "Noise", f"Of one intensity relative to the photograph: 0 to {NOISE_HIGH:.0%}", "viridis",
+    Layer("noise", "Noise", f"Noise of one intensity relative to the photograph: 0 to {NOISE_HIGH:.0%}", "viridis",
           lambda r: f"median {r.noise_share:.2%}"),
     Layer("consistency", "Pair sums", f"|I0 + I90 - I45 - I135| / S0: 0 to {EXCESS_HIGH:.0%}", "magma",
           lambda r: f"median {r.sum_error:.1%}" + ("" if r.pair_ratio is None else f", ratio {r.pair_ratio:.3f}")),
@@ -67,21 +66,21 @@ SHOT_LAYERS: tuple[Layer, ...] = (
     Layer("saturation", "Saturation", "Red: one picture at full scale. Blue: marked invalid, or black.", None,
           lambda r: f"{r.saturated:.1%} + {r.invalid:.1%}"),
 )  # fmt: skip
-"""Of captures with other pictures than four angles a view."""
+"""Layers of captures with other pictures than four angles per view."""
 
 
 def layer_uris(view: InspectedView, layers: Sequence[Layer]) -> dict[str, str]:
-    """Layers of a view as data URIs, by key."""
+    """Return layers of a view as data URIs, by key."""
     photograph = view.intensities().mean(dim=0)
-    photograph_shown = figures.radiance_to_rgb(photograph / max(quantile(photograph, 0.99), 1e-6))
-    pictures = {"s0": photograph_shown, "saturation": _marked(photograph_shown, view)}
+    rgb = figures.radiance_to_rgb(photograph / max(quantile(photograph, 0.99), 1e-6))
+    pictures = {"s0": rgb, "saturation": _mark(rgb, view)}
     if layers is LAYERS:
-        pictures |= _of_four(view)
+        pictures |= _polarization_layers(view)
     return {layer.key: data_uri(pictures[layer.key], layer.key, SIDE) for layer in layers}
 
 
-def _of_four(view: InspectedView) -> dict[str, Picture]:
-    """Charts that need pictures at four angles."""
+def _polarization_layers(view: InspectedView) -> dict[str, Picture]:
+    """Return charts that need pictures at four angles."""
     gray = view.intensities().mean(dim=-1)
     stokes = optics.stokes(gray)
     s0 = stokes[0].clamp(min=1e-6)
@@ -95,14 +94,14 @@ def _of_four(view: InspectedView) -> dict[str, Picture]:
     }
 
 
-def _marked(picture: Picture, view: InspectedView) -> Picture:
-    """The photograph in dark gray, with saturated and invalid pixels in color."""
+def _mark(picture: Picture, view: InspectedView) -> Picture:
+    """Return the photograph in dark gray, with saturated and invalid pixels in color."""
     dim = (picture.mean(axis=-1, keepdims=True) * 0.6).astype(np.uint8).repeat(3, axis=-1)
     for mask, color in (
         (view.black | view.invalid, INVALID_COLOR),
         (view.saturated & ~view.black, SATURATED_COLOR),
     ):
-        # Dilated by a pixel, so that single ones stay visible after downscaling.
+        # Dilation keeps single pixels visible after downscaling.
         dim[(max_pool2d(mask[None].float(), 3, 1, 1)[0] > 0).numpy()] = color
     return dim
 
@@ -111,7 +110,7 @@ FILE = "inspection.html"
 
 
 def inspection_html(inspection: Inspection, reporter: Reporter = SILENT) -> str:
-    """The HTML page; all names and texts in it are escaped.
+    """Return the HTML page; all names and texts in it are escaped.
 
     Args:
         inspection: the findings.
@@ -135,7 +134,7 @@ def inspection_html(inspection: Inspection, reporter: Reporter = SILENT) -> str:
         "inspection.html",
         title=f"Inspection of {capture.name}",
         summary=f"{len(capture.views)} views of {width} x {height} pixels, {capture.bits} bits; {posed}",
-        found=inspection,
+        inspection=inspection,
         layers=layers,
         ramps={layer.ramp: figures.color_gradient(layer.ramp) for layer in layers if layer.ramp},
         wheel=data_uri(figures.angle_wheel(), "aolp", 2 * SIDE),
@@ -152,40 +151,39 @@ def inspection_html(inspection: Inspection, reporter: Reporter = SILENT) -> str:
 
 
 def _figures(measurements: Sequence[ViewMeasurements]) -> list[tuple[str, ...]]:
-    """Head and rows of the table of figures; single shots have fewer of them."""
+    """Return header and rows of the table of measurements; single shots have fewer columns."""
     shots = any(r.exposures for r in measurements)
-    rows = []
-    for r in measurements:
-        row = {
-            "view": r.view,
-            "pictures": r.exposures or "0, 45, 90, 135",
-            "99 % under": f"{r.bright:.3f}",
-            "saturated": f"{r.saturated:.2%}",
-            "invalid": f"{r.invalid:.2%}",
-            "dark": f"{r.dark:.2%}",
-        }
-        if not shots:
-            del row["pictures"]
-            row |= {
-                "noise": f"{r.noise_share:.2%}",
-                "pair ratio": "n/a" if r.pair_ratio is None else f"{r.pair_ratio:.4f}",
-                "sum error": f"{r.sum_error:.2%}",
-                "DoLP median": f"{r.dolp[0]:.3f}",
-                "DoLP 99 %": f"{r.dolp[1]:.3f}",
-                "polarized": f"{r.polarized:.1%}",
-                "above diffuse limit": f"{r.above_limit:.1%}",
-            }
-        rows.append(row)
-    return [tuple(rows[0]), *(tuple(row.values()) for row in rows)]
+    columns: dict[str, Callable[[ViewMeasurements], str]] = {
+        "view": lambda r: r.view,
+        **({"pictures": lambda r: r.exposures or "0, 45, 90, 135"} if shots else {}),
+        "99 % under": lambda r: f"{r.bright:.3f}",
+        "saturated": lambda r: f"{r.saturated:.2%}",
+        "invalid": lambda r: f"{r.invalid:.2%}",
+        "dark": lambda r: f"{r.dark:.2%}",
+        **({} if shots else _FOUR_COLUMNS),
+    }
+    return [tuple(columns), *(tuple(text(r) for text in columns.values()) for r in measurements)]
+
+
+_FOUR_COLUMNS: dict[str, Callable[[ViewMeasurements], str]] = {
+    "noise": lambda r: f"{r.noise_share:.2%}",
+    "pair ratio": lambda r: "n/a" if r.pair_ratio is None else f"{r.pair_ratio:.4f}",
+    "sum error": lambda r: f"{r.sum_error:.2%}",
+    "DoLP median": lambda r: f"{r.dolp[0]:.3f}",
+    "DoLP 99 %": lambda r: f"{r.dolp[1]:.3f}",
+    "polarized": lambda r: f"{r.polarized:.1%}",
+    "above diffuse limit": lambda r: f"{r.above_limit:.1%}",
+}
+"""Columns of the table of measurements that need four angles."""
 
 
 SCHEMA = 2
-"""Raised whenever a key changes its meaning or goes away; new keys do not raise it."""
+"""Version of the record. It increases if a key changes its meaning or is removed, but not for new keys."""
 RECORD = "inspection.json"
 
 
 def inspection_record(inspection: Inspection) -> dict[str, Any]:
-    """The findings as plain JSON types; docs/reference/inspection.md describes the keys."""
+    """Return the findings as plain JSON types; docs/reference/inspection.md describes the keys."""
     capture = inspection.capture
     return dict(
         json_value(
@@ -217,14 +215,12 @@ def inspection_record(inspection: Inspection) -> dict[str, Any]:
 
 
 def write_inspection(inspection: Inspection, out: Path, reporter: Reporter = SILENT) -> tuple[Path, Path]:
-    """Write the page and ``inspection.json`` into a folder; returns their paths.
+    """Write the page and ``inspection.json`` into a folder; return their paths.
 
     Raises:
         PolarguideError: a file cannot be written.
     """
     make_folder(out)
-    page = out / FILE
-    record = out / RECORD
-    write_whole(record, to_json(inspection_record(inspection)))
-    write_text(page, inspection_html(inspection, reporter))
-    return page, record
+    write_whole(out / RECORD, to_json(inspection_record(inspection)))
+    write_text(out / FILE, inspection_html(inspection, reporter))
+    return out / FILE, out / RECORD

@@ -1,4 +1,4 @@
-"""Settings of ``inspect``, and the result of a check. Nothing here imports torch."""
+"""Settings of ``inspect``, and the result of a check. This module does not import torch."""
 
 from __future__ import annotations
 
@@ -17,17 +17,16 @@ Normals = Literal["auto", "points", "train"]
 
 @dataclass(frozen=True)
 class InspectSettings:
-    """How a capture is inspected.
+    """Settings of an inspection.
 
     Attributes:
-        normals: points uses points seen in several views alone; train also trains for normals, without polarization;
-            auto does so where the points do not decide.
-        steps: Optimizer steps of that training. It is kept in the folder of the inspection and goes on where it
-            stopped.
-        refractive_index: Of the surfaces; without it as scene.json says, else 1.5.
-        downscale: Average the pictures over boxes of this many pixels first; 0 until they are at most 640 pixels wide.
-        transfer: How the files encode radiance.
-        calibration: File of polarguide calibrate: inspect the scene as that of its sensor corrects it.
+        normals: Evidence on the angles. points uses only points that several views observe; train also trains normals
+            without polarization; auto trains if the points do not decide.
+        steps: Optimizer steps of this training. Its state is kept in the folder of the inspection, and resumed.
+        refractive_index: Refractive index of the surfaces. By default, that of scene.json, else 1.5.
+        downscale: Side of pixel boxes that are averaged first. 0 averages until pictures are at most 640 pixels wide.
+        transfer: Encoding of radiance in the files.
+        calibration: File of polarguide calibrate. The inspection corrects the scene with it.
     """
 
     normals: Normals = "auto"
@@ -40,7 +39,7 @@ class InspectSettings:
 
 Verdict = Literal["ok", "warning", "wrong", "n/a", "not verified"]
 ORDER: tuple[Verdict, ...] = ("n/a", "ok", "not verified", "warning", "wrong")
-"""From no verdict to the worst."""
+"""Verdicts from none to the worst."""
 TITLES = {
     "pair_sums": "Consistency of the four angles",
     "encoding": "Linear encoding",
@@ -65,24 +64,24 @@ TITLES = {
 }
 """Headings of the checks by key."""
 LCD_TEST = (
-    "Hold the filter before an LCD screen and turn it: the side that is towards the screen when it goes dark must face "
-    "the scene. If the filter was right: photograph glossy surfaces obliquely (50 to 65 degrees)."
+    "Hold the filter in front of an LCD screen and rotate it. The side that faces the screen when it becomes dark must "
+    "face the scene. If the filter was right, photograph glossy surfaces obliquely (50 to 65 degrees)."
 )
 """Advice for pictures without modulation."""
 
 
 @dataclass(frozen=True)
 class Check:
-    """The outcome of one check.
+    """Outcome of one check.
 
     Attributes:
-        key: its name in ``inspection.json``, one of ``TITLES``.
-        verdict: "ok"; "warning" where a person should decide; "wrong"; "n/a" where the check cannot be made;
-            "not verified" where it cannot be made although training relies on it.
-        finding: the result, one or two sentences.
-        remedy: the advice; empty if nothing is to be done.
-        views: the views concerned; empty for all.
-        figures: the numbers that the verdict rests on.
+        key: name in ``inspection.json``, one of ``TITLES``.
+        verdict: "ok"; "warning" for a decision by the user; "wrong"; "n/a" for an impossible check; "not verified" for
+            an impossible check of a property that training relies on.
+        finding: result, one or two sentences.
+        remedy: advice; empty if nothing is to be done.
+        views: views concerned; empty for all.
+        figures: numbers on which the verdict is based.
     """
 
     key: str

@@ -1,7 +1,7 @@
-"""Captures of single shots: what their pictures are, and whether they agree with the angles that the capture states.
+"""Checks of captures of single shots: kinds of pictures, and agreement with their stated angles.
 
 A short training without the stated angles estimates each picture's angle in closed form
-(``training.angles.polarizers``), and the two are compared.
+(``training.angles.polarizers``). The estimates are compared with the stated angles.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ import numpy as np
 
 from polarguide.capture import Scene
 from polarguide.capture.angle_evidence import (
+    AngleEstimate,
     AngleLimits,
     CommonRotation,
-    angle_difference,
     common_rotation,
     tolerance,
 )
@@ -26,12 +26,10 @@ from polarguide.capture.exposures import Exposure, determine_stokes
 from polarguide.capture.picture_sets import SetSamples, chosen_pixels, judge
 from polarguide.capture.view import FULL_CODE, View, listed
 from polarguide.inspection.capture import Capture
-from polarguide.inspection.evidence import short_run
+from polarguide.inspection.evidence import short_run, training_recipe
 from polarguide.inspection.settings import LCD_TEST, Check, Verdict, first_outcome
 from polarguide.raster import Backend
-from polarguide.recipes import recipe_named
 from polarguide.training.angles.polarizers import REMEDY, Judgment, Polarizers
-from polarguide.training.recipe import Recipe
 from polarguide.training.settings import StepReport
 
 RECIPE = "polarguide-stokes"
@@ -42,16 +40,16 @@ class ShotLimits:
     """Thresholds of the checks.
 
     Attributes:
-        certain: share of the median modulation (``FittedAngle``) from which a picture may contradict its stated angle.
-            At 0.7 a wrong line of the demo (0.67) went unnamed.
-        contradicts: smallest difference in degrees that contradicts a stated angle. The short training is 3 to 7
-            degrees off (median) on four scenes.
-        sigmas: standard deviations that a short training may be off by chance.
-        fewest: pictures that determine their angle from which on all are judged.
+        certain: smallest share of the median modulation (``FittedAngle``) of a picture that can contradict its stated
+            angle. At 0.7 a wrong line of the demo (0.67) was not detected.
+        contradicts: smallest difference in degrees that contradicts a stated angle. The short training has errors of 3
+            to 7 degrees (median) on four scenes.
+        sigmas: standard errors of a significant difference. See ``AngleLimits.sure``.
+        fewest: smallest number of pictures with a determined angle for a comparison.
         zero_off: degrees of a common offset for a warning.
         zero_wrong: degrees of a common offset for the verdict "wrong".
-        redundant: known angles of one view from which on they can contradict one another.
-        few_angles: different angles from which on S1 and S2 can be told apart, over the capture.
+        redundant: smallest number of known angles of one view that can contradict each other.
+        few_angles: smallest number of different angles in a capture that determines S1 and S2.
     """
 
     certain = 0.6
@@ -67,18 +65,18 @@ class ShotLimits:
 CHAOS = (
     "Look for shifted lines in angles.csv, or prepare with --angles unknown: training then finds the angles."
 )
-"""Advice for stated angles that have nothing to do with the pictures."""
+"""Advice for stated angles without relation to the pictures."""
 
 
 @dataclass(frozen=True)
 class ShotFindings:
-    """The polarizers of the pictures as the short training estimates them.
+    """Polarizers of the pictures, estimated by the short training.
 
     Attributes:
-        judgments: of each picture through a filter, without use of its stated angle; empty without a training.
-        stated: the exposures as the capture states them, one each.
-        why: why there was no training.
-        unfiltered: whether that is because no picture was taken through a filter.
+        judgments: judgment of each picture through a filter, without its stated angle; empty without a training.
+        stated: stated exposure of each judgment.
+        why: reason for the lack of a training.
+        unfiltered: True if no picture was taken through a filter.
     """
 
     judgments: tuple[Judgment, ...] = ()
@@ -87,24 +85,29 @@ class ShotFindings:
     unfiltered: bool = False
 
     @property
-    def telling(self) -> list[tuple[Judgment, float]]:
+    def determined(self) -> list[tuple[Judgment, float]]:
         """Pictures that determine their angle, with the stated angle of each."""
         rows = zip(self.judgments, self.stated, strict=True)
         return [(judgment, s.angle) for judgment, s in rows if s.angle is not None and judgment.tells]
 
     @property
+    def are_enough(self) -> bool:
+        """True if enough pictures determine their angle for a comparison."""
+        return len(self.determined) >= ShotLimits.fewest
+
+    @property
     def rotation(self) -> CommonRotation:
         """Sense and zero of the stated angles by the pictures that determine their angle."""
-        if len(self.telling) < ShotLimits.fewest:
+        if not self.are_enough:
             return CommonRotation()
-        return common_rotation([j.angle for j, _ in self.telling], [angle for _, angle in self.telling])
+        return common_rotation([j.angle for j, _ in self.determined], [angle for _, angle in self.determined])
 
     @property
     def undecided(self) -> tuple[Verdict, str]:
         """Verdict and finding of a check that has too few pictures to compare."""
         if all(exposure.angle is None for exposure in self.stated):
             return "n/a", "No angle is stated: training estimates them."
-        count = len(self.telling)
+        count = len(self.determined)
         return "not verified", f"Only {count} pictures with a stated angle determine it: too few to compare."
 
     def record(self) -> dict[str, Any]:
@@ -127,7 +130,7 @@ class ShotFindings:
 
 
 def without_angles(scene: Scene) -> Scene:
-    """Return the scene as if no angle of a picture through a filter were known."""
+    """Return the scene with unknown angles of all pictures through a filter."""
 
     def blank(view: View) -> View:
         return view.with_exposures(tuple(replace(e, angle=None) if e.filtered else e for e in view.exposures))
@@ -144,10 +147,10 @@ def estimate_shot_angles(
     backend: Backend,
     on_step: Callable[[StepReport], None],
 ) -> ShotFindings:
-    """Estimate the polarizer angle of every shot by a training that starts with no known angle.
+    """Estimate the polarizer angle of every shot by a training that starts without known angles.
 
     Args:
-        scene: scene at the size to train at; it needs training views.
+        scene: scene at the size of the training; it needs training views.
         folder: folder of the training's state, from which a stopped search resumes.
         steps: approximate number of training steps.
         refractive_index: refractive index of the surfaces.
@@ -156,11 +159,10 @@ def estimate_shot_angles(
     """
     if not any(exposure.filtered for view in scene.train_views for exposure in view.exposures):
         return ShotFindings(why="No picture was taken through a filter.", unfiltered=True)
-    recipe = recipe_named(RECIPE)
-    assert isinstance(recipe, Recipe)
+    recipe = training_recipe(RECIPE)
     blind = without_angles(scene)
     total = math.ceil(steps / recipe.angle_rules.last)
-    until = Polarizers(blind, recipe, total).search + 1  # angles are fitted when a step begins
+    until = Polarizers(blind, recipe, total).search + 1  # fits precede a step
     state = short_run(
         blind,
         folder,
@@ -200,15 +202,15 @@ def pictures_check(capture: Capture) -> Check:
             plain == len(exposures),
             "warning",
             f"{finding} Ordinary photographs train, without measured polarization.",
-            "If a filter was used, note its angles (or --angles unknown) and repeat prepare. If not, nothing is wrong; "
-            "some views through a filter would improve layers and normals.",
+            "If a filter was used, state its angles (or --angles unknown) and repeat prepare. If not, nothing is "
+            "wrong. Some views through a filter would improve layers and normals.",
         ),
         (
             not unknown and len(angles) < ShotLimits.few_angles,
             "warning",
             finding,
-            "Turn the filter between shots: with at least three angles, spread over half a turn, no direction of "
-            "the polarization stays unseen.",
+            "Rotate the filter between shots. At least three angles, spread over 180 degrees, measure all directions "
+            "of the polarization.",
         ),
         (True, "ok", finding, ""),
     )
@@ -216,7 +218,7 @@ def pictures_check(capture: Capture) -> Check:
 
 
 def agreement_checks(capture: Capture) -> list[Check]:
-    """Check whether the pictures of a view agree with one another; empty if no view has four or more known angles."""
+    """Check if the pictures of a view agree with each other; empty if no view has four or more known angles."""
     compared = 0
     notes = []
     wrong: list[str] = []
@@ -236,10 +238,10 @@ def agreement_checks(capture: Capture) -> list[Check]:
             step=1 / FULL_CODE,
         )
         compared += 1
-        judged = judge(samples, samples.gray(chosen_pixels(samples)).astype(np.float64))
-        if judged.notes:
+        judgment = judge(samples, samples.gray(chosen_pixels(samples)).astype(np.float64))
+        if judgment.notes:
             wrong.append(view.name)
-            notes += [f"{view.name}: {note.removesuffix(' It is left out.')}" for note in judged.notes]
+            notes += [f"{view.name}: {note.removesuffix(' It is left out.')}" for note in judgment.notes]
     if not compared:
         return []
     outcome = first_outcome(
@@ -247,8 +249,8 @@ def agreement_checks(capture: Capture) -> list[Check]:
         (
             notes,
             "wrong",
-            f"In {len(wrong)} of {compared} views, pictures contradict one another. {listed(notes)}",
-            "Correct their lines of angles.csv, or write unknown; repeat prepare without pictures that moved.",
+            f"In {len(wrong)} of {compared} views, pictures contradict each other. {listed(notes)}",
+            "Correct their lines of angles.csv, or write unknown. Repeat prepare without pictures that moved.",
         ),
     )
     figures = {"views": compared, "contradicting": len(wrong)}
@@ -276,7 +278,7 @@ def _modulation(findings: ShotFindings) -> Check:
     plain = tuple(dict.fromkeys(j.view for j in findings.judgments if j.unfiltered))
     vague = sum(j.vague for j in findings.judgments)
     modulation = float(np.median([j.modulation for j in findings.judgments]))
-    finding = f"{count - len(plain) - vague} of {count} pictures tell the angle of their filter."
+    finding = f"{count - len(plain) - vague} of {count} pictures determine the angle of their filter."
     outcome = first_outcome(
         (
             2 * len(plain) > count,
@@ -288,13 +290,13 @@ def _modulation(findings: ShotFindings) -> Check:
         (
             plain,
             "warning",
-            f"{finding} Taken without a filter, as it looks: {listed(list(plain))}.",
+            f"{finding} Probably taken without a filter: {listed(list(plain))}.",
             "If so, write none for them in angles.csv.",
         ),
         (
             2 * vague > count,
             "warning",
-            f"{finding} The others show too little polarization for that.",
+            f"{finding} The others have too little polarization.",
             "Photograph glossy surfaces obliquely (50 to 65 degrees); or train longer with --steps.",
         ),
         (True, "ok", finding, ""),
@@ -304,18 +306,18 @@ def _modulation(findings: ShotFindings) -> Check:
 
 
 def _sense(findings: ShotFindings, sense: int | None) -> Check:
-    if len(findings.telling) < ShotLimits.fewest:
+    if not findings.are_enough:
         return Check("handedness", *findings.undecided)
-    stated = np.radians([angle for _, angle in findings.telling])
+    stated = np.radians([angle for _, angle in findings.determined])
     alike = max(abs(np.exp(1j * times * stated).mean()) for times in (2, 4)) > AngleLimits.same_direction
     outcome = first_outcome(
-        (alike, "not verified", "The stated angles, modulo 90 degrees, differ too little to tell.", ""),
+        (alike, "not verified", "The stated angles, modulo 90 degrees, differ too little to decide.", ""),
         (sense is None, "warning", "The pictures agree with neither sense.", CHAOS),
         (sense == 1, "ok", "Counter-clockwise as displayed.", ""),
         (
             sense == -1,
             "wrong",
-            "Clockwise as displayed: the pictures agree only if the angles count the other way.",
+            "Clockwise as displayed: the pictures agree only with the opposite sense.",
             "Repeat prepare with the other --sense and a new --out.",
         ),
     )
@@ -327,7 +329,7 @@ def _zero(findings: ShotFindings, rotation: CommonRotation) -> Check:
     sense, offset, error = rotation
     if sense is None:
         return Check("zero_offset", *findings.undecided)
-    finding = f"The zero of the filter lies at {offset:+.1f}° ± {error:.1f}° from where it is stated to lie."
+    finding = f"The zero of the filter differs from the stated one by {offset:+.1f}° ± {error:.1f}°."
     warning, wrong = (
         abs(offset) > tolerance(floor, error, sigmas=ShotLimits.sigmas)
         for floor in (ShotLimits.zero_off, ShotLimits.zero_wrong)
@@ -338,8 +340,8 @@ def _zero(findings: ShotFindings, rotation: CommonRotation) -> Check:
             True,
             "wrong" if wrong else "warning",
             finding,
-            f"Repeat prepare with --zero changed by {offset:+.0f} degrees and a new --out; this training itself is "
-            "good to a few degrees.",
+            f"Repeat prepare with --zero changed by {offset:+.0f} degrees and a new --out. This training has an error "
+            "of a few degrees.",
         ),
     )
     return Check("zero_offset", *outcome, figures={"offset_degrees": offset, "error_degrees": error})
@@ -353,42 +355,38 @@ def _each(findings: ShotFindings, rotation: CommonRotation) -> Check:
         doubtful = sum(j.doubtful for j in findings.judgments)
         doubts = verdict == "n/a" and 2 * doubtful > unknown
         outcome = first_outcome(
-            (
-                len(findings.telling) >= ShotLimits.fewest,
-                "wrong",
-                "The pictures contradict the stated angles.",
-                CHAOS,
-            ),
+            (findings.are_enough, "wrong", "The pictures contradict the stated angles.", CHAOS),
             (
                 doubts,
                 "warning",
-                f"No angle is specified, and {doubtful} of the {unknown} that were found are doubtful.",
+                f"No angle is stated, and {doubtful} of the {unknown} estimated angles are doubtful.",
                 REMEDY,
             ),
             (True, "ok" if verdict == "n/a" else verdict, finding, ""),
         )
         return Check("angles", *outcome, figures={"doubtful": doubtful, "unknown": unknown} if doubts else {})
     rows = [
-        (j, angle, abs(angle_difference(j.angle, sense * angle + offset))) for j, angle in findings.telling
+        (j, angle, AngleEstimate(j.angle, j.spread, sense * angle + offset))
+        for j, angle in findings.determined
     ]
-    typical = float(np.median([apart for _, _, apart in rows]))
+    typical = float(np.median([abs(estimate.off) for _, _, estimate in rows]))
     certain = ShotLimits.certain * float(np.median([j.modulation for j in findings.judgments]))
     off = [
         (j, angle)
-        for j, angle, apart in rows
-        if apart > tolerance(ShotLimits.contradicts, j.spread, typical, sigmas=ShotLimits.sigmas)
+        for j, angle, estimate in rows
+        if estimate.contradicts(ShotLimits.contradicts, typical, sigmas=ShotLimits.sigmas)
         and j.modulation > certain
         and not j.poorly_explained
     ]
     names = [f"{j.view} ({angle:g}°, looks like {sense * (j.angle - offset) % 180:.0f}°)" for j, angle in off]
-    finding = f"{len(rows)} pictures lie {typical:.1f}° from the stated angles (median)."
+    finding = f"The angles of {len(rows)} pictures differ by {typical:.1f}° from the stated angles (median)."
     outcome = first_outcome(
         (not off, "ok", finding, ""),
         (
             off,
             "wrong" if 5 * len(off) > len(rows) else "warning",
             f"{finding} Contradicting: {listed(names)}.",
-            "Compare them with your notes; correct their lines of angles.csv, or write unknown.",
+            "Correct their lines of angles.csv, or write unknown.",
         ),
     )
     figures = {"median_degrees": typical, "compared": len(rows), "unknown": unknown}

@@ -1,4 +1,4 @@
-"""Checks that compare views with one another at the points of the model: their exposures, and their focal lengths."""
+"""Checks that compare views at the points of the model: their exposures and focal lengths."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ class ViewLimits:
     """Thresholds of the checks.
 
     Attributes:
-        fewest: points from which on a focal length is estimated.
+        fewest: smallest number of points for the estimate of a focal length.
         focal_differs: difference of the logarithm of a focal length for a warning; 1 % turns a ray at 30 degrees by
             0.25 degrees.
         focal_wrong: the same for the verdict "wrong".
-        step: stops by which cameras set exposures; with a larger error, equal exposures are not confirmed.
+        step: step of camera exposures in stops; with a larger error, equal exposures are not confirmed.
     """
 
     fewest = 50
@@ -36,10 +36,10 @@ class ViewLimits:
 
 
 def view_exposure_check(capture: Capture) -> Check:
-    """Check whether the views were exposed and white-balanced alike."""
+    """Check whether the views have equal exposure and white balance."""
     exposures = capture.exposures
     if exposures is None or not np.isfinite(exposures.logs).any():
-        return Check("view_exposure", "n/a", "No points that views have in common are stored in the model.")
+        return Check("view_exposure", "n/a", "The model stores no points that views share.")
     logs = exposures.significant / math.log(2)
     known = np.isfinite(logs).all(axis=1)
     size = np.where(known, np.abs(logs).max(axis=1), 0.0)
@@ -56,63 +56,53 @@ def view_exposure_check(capture: Capture) -> Check:
     changes = [f"{names[k]} {logs[k][np.abs(logs[k]).argmax()]:+.2f}" for k in strongest]
     remedy = "Training and evaluation divide each color of these views by its gain."
     if capture.keeps_gains:
-        remedy = (
-            "prepare --gains none left them. Prepare without it, and training divides each color of a view by its "
-            "gain."
-        )
+        remedy = "Prepare without --gains none, so that training divides each color of a view by its gain."
     outcome = first_outcome(
         (
             strongest,
             "warning",
-            f"{len(strongest)} of {len(names)} views were exposed or white-balanced otherwise than the mean, by points "
-            f"in common ({precision}). Stops: {listed(changes)}.",
-            f"{remedy} Next time, fix exposure and white balance.",
+            f"By shared points, exposure or white balance of {len(strongest)} of {len(names)} views differs from the "
+            f"mean ({precision}). Stops: {listed(changes)}.",
+            f"{remedy} Use fixed exposure and white balance for new captures.",
         ),
         (
             errors[0] > ViewLimits.step,
             "not verified",
-            f"The points that views have in common are too few to compare their exposures ({precision}).",
-            "Add views between those there are.",
+            f"The views share too few points to compare their exposures ({precision}).",
+            "Add views between the existing ones.",
         ),
-        (
-            True,
-            "ok",
-            f"The points that views have in common are equally bright in all of them ({precision}).",
-            "",
-        ),
+        (True, "ok", f"Shared points are equally bright in all views ({precision}).", ""),
     )
     return Check("view_exposure", *outcome, tuple(names[k] for k in strongest), figures)
 
 
 def lens_check(capture: Capture) -> Check:
-    """Check whether each view alone agrees with the focal length that the model has for it."""
+    """Check whether each view alone agrees with its focal length in the model."""
     if capture.model is None:
         return Check("focal_lengths", "n/a", "There are no poses.")
-    found = {
-        view.name: alone
+    fits = {
+        view.name: fit
         for view in capture.posed
-        if (alone := _focal_length_alone(capture.model, view.name)) is not None
+        if (fit := _focal_length_alone(capture.model, view.name)) is not None
     }
-    if len(found) < 3:
-        why = f"Fewer than 3 views have {ViewLimits.fewest} points with their places in the pictures."
-        return Check("focal_lengths", "n/a", why)
-    names = list(found)
-    logs, errors = np.array(list(found.values())).T
+    if len(fits) < 3:
+        finding = f"Fewer than 3 views have {ViewLimits.fewest} points with positions in the pictures."
+        return Check("focal_lengths", "n/a", finding)
+    names = list(fits)
+    logs, errors = np.array(list(fits.values())).T
     off = significant(np.abs(logs), errors) & (np.abs(logs) > ViewLimits.focal_differs)
     usual = float(np.sqrt(np.mean(logs**2)))
     order = [int(k) for k in np.argsort(-np.abs(logs)) if off[k]]
     changes = listed([f"{names[k]} {math.expm1(logs[k]):+.1%}" for k in order])
-    finding = (
-        f"Where the points hold and a view alone is free, its focal length changes by {usual:.1%} (rms)."
-    )
+    finding = f"A fit of each view to fixed points changes its focal length by {usual:.1%} (rms)."
     outcome = first_outcome(
         (not order, "ok", finding, ""),
         (
             order,
             "wrong" if np.abs(logs[off]).max(initial=0) > ViewLimits.focal_wrong else "warning",
             f"{finding} It contradicts the model in {len(order)} views ({changes}).",
-            "Poses are wrong where several cameras were taken for one: a telephone that changed its lens, a zoom, a "
-            "crop. Prepare the original files, whose EXIF tells them apart, or bring a model with a camera for each.",
+            "Poses are wrong if several cameras share one model: a phone that changed its lens, a zoom, or a crop. "
+            "Prepare the original files, whose EXIF distinguishes them, or use a model with a camera for each.",
         ),
     )
     figures = {"rms": usual, "views": dict(zip(names, (np.exp(logs) - 1).tolist(), strict=True))}
@@ -120,10 +110,10 @@ def lens_check(capture: Capture) -> Check:
 
 
 def _focal_length_alone(model: ColmapModel, view: str) -> tuple[float, float] | None:
-    """Logarithm of a view's own focal length over the model's, and its standard error; None with too few points.
+    """Return the logarithm of the ratio of a view's own focal length to the model's, and its standard error.
 
-    The points hold; pose and focal length minimize the distances in the picture. The error assumes independent
-    distances of the deviation that they have.
+    Points are fixed. Pose and focal length minimize the distances in the picture. The error assumes independent
+    distances. Too few points give None.
     """
     pixels, places = model.correspondences(view)
     if len(pixels) < ViewLimits.fewest:
@@ -138,10 +128,10 @@ def _focal_length_alone(model: ColmapModel, view: str) -> tuple[float, float] | 
     center = np.array([camera.cx, camera.cy])
 
     def distances(change: NDArray[np.float64]) -> NDArray[Any]:
-        turned = (local - middle) @ Rotation.from_rotvec(change[:3]).as_matrix().T
-        moved = turned + middle + depth * change[3:6]
-        seen = moved[:, :2] / moved[:, 2:] * np.exp(change[6]) * focal + center
-        return np.asarray((seen - pixels).ravel())
+        rotated = (local - middle) @ Rotation.from_rotvec(change[:3]).as_matrix().T
+        moved = rotated + middle + depth * change[3:6]
+        projected = moved[:, :2] / moved[:, 2:] * np.exp(change[6]) * focal + center
+        return np.asarray((projected - pixels).ravel())
 
     fitted = least_squares(distances, np.zeros(7), loss="soft_l1")
     deviation = TO_DEVIATION * float(np.median(np.abs(fitted.fun)))

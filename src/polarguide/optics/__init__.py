@@ -1,7 +1,7 @@
 """Polarization optics: pure functions on tensors of any batch shape, float dtype and device.
 
-They are differentiable, and value and gradient stay finite at every degenerate point (no light, no
-polarization, normal and grazing incidence).
+All functions are differentiable. Values and gradients are finite at degenerate points: no light, no polarization,
+normal and grazing incidence.
 """
 
 from polarguide.geometry.polarizer import ANGLES

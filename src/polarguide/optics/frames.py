@@ -1,9 +1,8 @@
-"""Directions about a view ray: the lens frame, and normals as zenith and azimuth in it.
+"""Directions relative to a view ray: the lens frame, and zenith and azimuth of normals in it.
 
-All vectors are in camera axes (OpenCV: x right, y down, z forward). ``rays`` are unit vectors from the camera
-into the scene and broadcast against the other arguments. A polarization angle is measured in the lens frame
-of its pixel: the frame that an ideal rotationally symmetric lens carries from the optical axis to that
-pixel's ray.
+All vectors are in camera axes (OpenCV: x right, y down, z forward). ``rays`` are unit vectors from the camera into the
+scene and broadcast against the other arguments. Polarization angles are measured in the lens frame of a pixel. An ideal
+rotationally symmetric lens carries this frame from the optical axis to the ray of the pixel.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ from polarguide.optics._numerics import for_arrays, safe_atan2
 
 @for_arrays
 def lens_frame(rays: Tensor) -> tuple[Tensor, Tensor]:
-    """Image right and image up, carried from the optical axis to each ray by the smallest rotation.
+    """Return image right and image up, carried from the optical axis to each ray by the smallest rotation.
 
     ``x_ref``, ``up_ref`` and ``-ray`` form a right-handed orthonormal basis. On the axis they are (1, 0, 0)
     and (0, -1, 0).
@@ -29,7 +28,7 @@ def lens_frame(rays: Tensor) -> tuple[Tensor, Tensor]:
         (x_ref, up_ref), each [..., 3] unit.
     """
     x, y, z = rays.unbind(-1)
-    # A ray straight back has no smallest rotation; the clamp gives it a frame all the same.
+    # A ray straight back has no smallest rotation; the clamp defines its frame.
     scale = 1 / (1 + z).clamp(min=torch.finfo(rays.dtype).eps)
     mixed = x * y * scale
     x_ref = torch.stack((1 - x * x * scale, -mixed, -x), dim=-1)
@@ -39,14 +38,14 @@ def lens_frame(rays: Tensor) -> tuple[Tensor, Tensor]:
 
 @for_arrays
 def azimuth(vectors: Tensor, rays: Tensor) -> Tensor:
-    """Azimuth of a vector about the ray: ``atan2(v . up_ref, v . x_ref)``.
+    """Return the azimuth of a vector about the ray: ``atan2(v . up_ref, v . x_ref)``.
 
     Args:
         vectors: [..., 3], any length.
         rays: [..., 3] unit.
 
     Returns:
-        [...] radians in [-pi, pi]; 0, with zero gradient, where the vector is parallel to the ray.
+        [...] radians in [-pi, pi]; 0 with zero gradient if the vector is parallel to the ray.
     """
     x_ref, up_ref = lens_frame(rays)
     return safe_atan2(dot(vectors, up_ref), dot(vectors, x_ref))
@@ -54,15 +53,15 @@ def azimuth(vectors: Tensor, rays: Tensor) -> Tensor:
 
 @for_arrays
 def zenith(normals: Tensor, rays: Tensor) -> Tensor:
-    """Angle between a normal and the direction back to the camera, ``-ray``.
+    """Return the angle between a normal and the direction to the camera, ``-ray``.
 
     Args:
         normals: [..., 3], any length.
         rays: [..., 3] unit.
 
     Returns:
-        [...] radians in [0, pi]; more than pi/2 where the normal faces away, 0 for a zero normal. The
-        gradient is 0 where the normal is parallel to the ray (an arc cosine would give infinity there).
+        [...] radians in [0, pi]; more than pi/2 if the normal faces away, 0 for a zero normal. The gradient is 0 if the
+        normal is parallel to the ray, where an arc cosine would have an infinite one.
     """
     along = dot(normals, rays)
     across = torch.linalg.vector_norm(normals - along[..., None] * rays, dim=-1)
@@ -71,10 +70,10 @@ def zenith(normals: Tensor, rays: Tensor) -> Tensor:
 
 @for_arrays
 def normal_from_angles(zenith: Tensor, azimuth: Tensor, rays: Tensor) -> Tensor:
-    """Unit normal with a given zenith and azimuth about the ray.
+    """Return the unit normal with a zenith and an azimuth about the ray.
 
-    ``-cos(zenith) ray + sin(zenith) (cos(azimuth) x_ref + sin(azimuth) up_ref)``; it faces the camera for
-    zeniths below pi/2.
+    ``-cos(zenith) ray + sin(zenith) (cos(azimuth) x_ref + sin(azimuth) up_ref)``; it faces the camera for zeniths below
+    pi/2.
 
     Args:
         zenith, azimuth: [...] radians.
@@ -87,6 +86,6 @@ def normal_from_angles(zenith: Tensor, azimuth: Tensor, rays: Tensor) -> Tensor:
     right = sine * torch.cos(azimuth)
     up = sine * torch.sin(azimuth)
     back = torch.cos(zenith)
-    # Component by component: torch is slow where the last axis of three broadcasts.
+    # Component by component, because PyTorch is slow if the last axis of three broadcasts.
     axes = zip(*(vectors.unbind(-1) for vectors in (*lens_frame(rays), rays)), strict=True)
     return torch.stack([right * x + up * y - back * ray for x, y, ray in axes], dim=-1)

@@ -1,15 +1,16 @@
 """Fresnel's equations for a smooth dielectric, their inverses, and the equations for a smooth conductor.
 
-``zenith`` is the angle of incidence in radians, in [0, pi/2] (values outside are clamped); ``refractive_index``
-is more than 1, a number or a tensor that broadcasts against the zenith.
+``zenith`` is the angle of incidence in radians, in [0, pi/2]; values outside are clamped. ``refractive_index`` is more
+than 1, a number or a tensor that broadcasts against the zenith.
 
-Everything is written in ``c = cos i`` and ``t = n cos r = sqrt(n^2 - sin^2 i)`` (Snell's law). In these
-variables the equations are quotients without a singular point between normal and grazing incidence, whereas
-the textbook forms in ``i - r`` and ``i + r`` are 0/0 at normal incidence.
+All equations are written in ``c = cos i`` and ``t = n cos r = sqrt(n^2 - sin^2 i)`` (Snell's law). In these variables
+they are quotients without a singular point between normal and grazing incidence. The textbook forms in ``i - r`` and
+``i + r`` are 0/0 at normal incidence.
 
-A conductor, of complex index ``n + i k``, reflects most of the light, has no diffuse lobe, and polarizes what it
-reflects perpendicular to the plane of incidence like the specular lobe of a dielectric, but little: there is no
-Brewster's angle. In ``c`` and ``a + i b = sqrt((n + i k)^2 - sin^2 i)``, the complex counterpart of ``t``,
+A conductor has a complex index ``n + i k``, reflects most of the light and has no diffuse lobe. Like the specular
+lobe of a dielectric, its reflection is polarized perpendicular to the plane of incidence. The degree of polarization
+is small, and no Brewster's angle exists. In ``c`` and ``a + i b = sqrt((n + i k)^2 - sin^2 i)``, the complex
+counterpart of ``t``,
 
     Rs = (a^2 + b^2 + c^2 - 2 a c) / (a^2 + b^2 + c^2 + 2 a c)
     Rp = Rs (x - y sin^2 i) / (x + y sin^2 i),  x = c^2 (a^2 + b^2) + sin^4 i,  y = 2 a c
@@ -28,12 +29,12 @@ from polarguide.optics._numerics import check_refractive_index, for_arrays, safe
 
 
 def _cosine(zenith: Tensor) -> Tensor:
-    # In floating point cos(pi/2) can be a little below zero; a reflectance above 1 would follow.
+    # Rounding can make cos(pi/2) negative, and a reflectance larger than 1.
     return torch.cos(zenith.clamp(0, math.pi / 2)).clamp(min=0)
 
 
 def _refracted(c: Tensor, refractive_index: float | Tensor) -> tuple[Tensor, Tensor]:
-    """``t = n cos r`` and ``n^2 c``."""
+    """Return ``t = n cos r`` and ``n^2 c``."""
     check_refractive_index(refractive_index)
     n2 = refractive_index * refractive_index
     return torch.sqrt(n2 - 1 + c * c), n2 * c
@@ -41,7 +42,7 @@ def _refracted(c: Tensor, refractive_index: float | Tensor) -> tuple[Tensor, Ten
 
 @for_arrays
 def reflectances_from_cosine(cosine: Tensor, refractive_index: float | Tensor = 1.5) -> tuple[Tensor, Tensor]:
-    """Power reflectances from the cosine of the angle of incidence (Fresnel's equations).
+    """Return power reflectances for the cosine of the angle of incidence (Fresnel's equations).
 
     ``Rs = ((c - t) / (c + t))^2``, ``Rp = ((n^2 c - t) / (n^2 c + t))^2``.
 
@@ -62,7 +63,7 @@ def reflectances_from_cosine(cosine: Tensor, refractive_index: float | Tensor = 
 
 @for_arrays
 def reflectances(zenith: Tensor, refractive_index: float | Tensor = 1.5) -> tuple[Tensor, Tensor]:
-    """Power reflectances perpendicular (s) and parallel (p) to the plane of incidence (Fresnel's equations).
+    """Return power reflectances perpendicular (s) and parallel (p) to the plane of incidence (Fresnel's equations).
 
     ``((n - 1) / (n + 1))^2`` for both at normal incidence, 1 for both at grazing incidence.
 
@@ -81,10 +82,10 @@ def reflectances(zenith: Tensor, refractive_index: float | Tensor = 1.5) -> tupl
 
 @for_arrays
 def transmittances(zenith: Tensor, refractive_index: float | Tensor = 1.5) -> tuple[Tensor, Tensor]:
-    """Power transmittances (Ts, Tp) through the surface, ``4 c t / (c + t)^2`` and
-    ``4 n^2 c t / (n^2 c + t)^2``.
+    """Return power transmittances through the surface (Fresnel's equations).
 
-    They are the same in both directions, and ``R + T = 1`` for each polarization.
+    ``Ts = 4 c t / (c + t)^2`` and ``Tp = 4 n^2 c t / (n^2 c + t)^2``. They are equal in both directions, and
+    ``R + T = 1`` for each polarization.
 
     Args:
         zenith: [...] angle outside the dielectric, radians.
@@ -103,13 +104,12 @@ def transmittances(zenith: Tensor, refractive_index: float | Tensor = 1.5) -> tu
 
 @for_arrays
 def dolp_slopes(cosine: Tensor, refractive_index: float | Tensor = 1.5) -> tuple[Tensor, Tensor]:
-    """Degrees of polarization of both lobes divided by ``sin^2(zenith)``, from the cosine of the zenith.
+    """Return the degrees of polarization of both lobes over ``sin^2(zenith)``, for the cosine of the zenith.
 
-    ``rho_s = (Rs - Rp) / (Rs + Rp) = sin^2(i) * 2 c t / (c^2 t^2 + sin^4 i)`` and ``rho_d = u / (2 - u)``
-    with ``u = sin^2(i - r) = sin^2(i) * ((t - c) / n)^2``. Both vanish as ``sin^2`` at normal incidence,
-    where the direction of polarization is undefined; without that factor they are smooth, so a caller that
-    multiplies by the components of the projected normal (whose squares sum to ``sin^2``) never meets the
-    singular direction.
+    ``rho_s = (Rs - Rp) / (Rs + Rp) = sin^2(i) * 2 c t / (c^2 t^2 + sin^4 i)`` and ``rho_d = u / (2 - u)`` with
+    ``u = sin^2(i - r) = sin^2(i) * ((t - c) / n)^2``. Both vanish as ``sin^2`` at normal incidence, where the direction
+    of polarization is undefined. Without this factor they are smooth. A caller multiplies them by the components of the
+    projected normal, whose squares sum to ``sin^2``, and so avoids the undefined direction.
 
     Args:
         cosine: [...] cos(zenith); negative values count as grazing.
@@ -132,10 +132,10 @@ def dolp_slopes(cosine: Tensor, refractive_index: float | Tensor = 1.5) -> tuple
 
 @for_arrays
 def specular_dolp(zenith: Tensor, refractive_index: float | Tensor = 1.5) -> Tensor:
-    """Degree of polarization of specularly reflected light, ``(Rs - Rp) / (Rs + Rp)``.
+    """Return the degree of polarization of specularly reflected light, ``(Rs - Rp) / (Rs + Rp)``.
 
-    The incident light is unpolarized. 0 at normal and grazing incidence, 1 at Brewster's angle; the field is
-    perpendicular to the plane of incidence.
+    The incident light is unpolarized. The degree is 0 at normal and grazing incidence and 1 at Brewster's angle. The
+    field is perpendicular to the plane of incidence.
 
     Args:
         zenith: [...] radians.
@@ -152,10 +152,10 @@ def specular_dolp(zenith: Tensor, refractive_index: float | Tensor = 1.5) -> Ten
 
 @for_arrays
 def diffuse_dolp(zenith: Tensor, refractive_index: float | Tensor = 1.5) -> Tensor:
-    """Degree of polarization of light that leaves from below the surface, ``(Tp - Ts) / (Tp + Ts)``.
+    """Return the degree of polarization of light from below the surface, ``(Tp - Ts) / (Tp + Ts)``.
 
-    The light is unpolarized inside. It grows from 0 at normal incidence to ``diffuse_dolp_limit`` at grazing;
-    the field lies in the plane of incidence.
+    The light is unpolarized inside. The degree grows from 0 at normal incidence to ``diffuse_dolp_limit`` at grazing
+    incidence. The field lies in the plane of incidence.
 
     Args:
         zenith: [...] radians.
@@ -172,9 +172,7 @@ def diffuse_dolp(zenith: Tensor, refractive_index: float | Tensor = 1.5) -> Tens
 
 @for_arrays
 def brewster(refractive_index: float | Tensor = 1.5) -> Tensor:
-    """Brewster's angle ``atan(n)`` in radians, where Rp = 0.
-
-    A number gives a float64 scalar tensor.
+    """Return Brewster's angle ``atan(n)`` in radians, at which Rp = 0; a float64 scalar tensor for a number.
 
     Raises:
         ValueError: ``refractive_index`` is a number not above 1.
@@ -187,9 +185,9 @@ def brewster(refractive_index: float | Tensor = 1.5) -> Tensor:
 
 @for_arrays
 def diffuse_dolp_limit(refractive_index: float | Tensor = 1.5) -> float | Tensor:
-    """Largest degree of polarization that diffuse light reaches (at grazing): ``(n^2 - 1) / (n^2 + 1)``.
+    """Return the maximum degree of polarization of diffuse light, at grazing incidence: ``(n^2 - 1) / (n^2 + 1)``.
 
-    A number for a number, a tensor for a tensor.
+    The result is a number for a number and a tensor for a tensor.
 
     Raises:
         ValueError: ``refractive_index`` is a number not above 1.
@@ -201,17 +199,16 @@ def diffuse_dolp_limit(refractive_index: float | Tensor = 1.5) -> float | Tensor
 
 @for_arrays
 def diffuse_zenith(dolp: Tensor, refractive_index: float | Tensor = 1.5) -> Tensor:
-    """Zenith at which diffuse light has this degree of polarization: the exact inverse of ``diffuse_dolp``.
+    """Return the zenith at which diffuse light has a degree of polarization: the exact inverse of ``diffuse_dolp``.
 
-    ``atan2(n sqrt(2d), n sqrt(1 - d) - sqrt(1 + d))``, from ``cos^2(i - r) = (1 - d) / (1 + d)`` and Snell's
-    law.
+    ``atan2(n sqrt(2d), n sqrt(1 - d) - sqrt(1 + d))``, from ``cos^2(i - r) = (1 - d) / (1 + d)`` and Snell's law.
 
     Args:
         dolp: [...]; clamped to [0, ``diffuse_dolp_limit(refractive_index)``].
         refractive_index: refractive index of the surface, more than 1.
 
     Returns:
-        [...] radians in [0, pi/2]. The gradient, infinite in the limit of d = 0, is 0 at d = 0 itself.
+        [...] radians in [0, pi/2]. The gradient is 0 at d = 0, although it has no limit there.
 
     Raises:
         ValueError: ``refractive_index`` is a number not above 1.
@@ -226,20 +223,20 @@ def diffuse_zenith(dolp: Tensor, refractive_index: float | Tensor = 1.5) -> Tens
 
 @for_arrays
 def specular_zeniths(dolp: Tensor, refractive_index: float | Tensor = 1.5) -> tuple[Tensor, Tensor]:
-    """The two zeniths at which specular light has this degree of polarization: inverses of ``specular_dolp``.
+    """Return the two zeniths at which specular light has a degree of polarization: inverses of ``specular_dolp``.
 
-    With ``q = tan i tan r`` Fresnel's equations give ``d = 2q / (1 + q^2)``, hence
-    ``q = d / (1 + sqrt(1 - d^2))`` below Brewster's angle and its reciprocal above. ``sin^2 i`` then solves
-    ``(1 - q^2) x^2 + q^2 (n^2 + 1) x - q^2 n^2 = 0``; the roots are written with the square root in the
-    denominator, where nothing cancels at q = 1 (Brewster) nor at q = 0, and given as tangents.
+    With ``q = tan i tan r`` Fresnel's equations give ``d = 2q / (1 + q^2)``, hence ``q = d / (1 + sqrt(1 - d^2))``
+    below Brewster's angle and its reciprocal above. Then ``x = sin^2 i`` solves ``(1 - q^2) x^2 + q^2 (n^2 + 1) x -
+    q^2 n^2 = 0``. The roots are written with the square root in the denominator and computed as tangents, so that no
+    digits cancel at q = 1 (Brewster's angle) and q = 0.
 
     Args:
         dolp: [...]; clamped to [0, 1].
         refractive_index: refractive index of the surface, more than 1.
 
     Returns:
-        (below, above) Brewster's angle, each [...] radians in [0, pi/2]; equal at d = 1. Gradients, infinite
-        in the limits of d = 0 (below) and d = 1, are 0 at these points themselves.
+        (below, above) Brewster's angle, each [...] radians in [0, pi/2]; equal at d = 1. Gradients are 0 at d = 0
+        (below) and d = 1, although they have no limit there.
 
     Raises:
         ValueError: ``refractive_index`` is a number not above 1.
@@ -255,24 +252,25 @@ def specular_zeniths(dolp: Tensor, refractive_index: float | Tensor = 1.5) -> tu
     return below, above
 
 
-# Reflectances at normal incidence for which ``conductor_index`` gives a conductor.
 LEAST_REFLECTANCE = 0.1
+"""Lower bound of reflectances at normal incidence for which ``conductor_index`` returns a conductor."""
 LARGEST_REFLECTANCE = 0.985
+"""Upper bound of reflectances at normal incidence for which ``conductor_index`` returns a conductor."""
 
 
 def _terms(cosine: Tensor, n: Tensor, k: Tensor) -> tuple[Tensor, ...]:
-    """``c``, ``sin^2 i``, ``a``, ``a^2 + b^2``."""
+    """Return ``c``, ``sin^2 i``, ``a`` and ``a^2 + b^2``."""
     c = cosine.clamp(0, 1)
     sine2 = 1 - c * c
     real = n * n - k * k - sine2
     squared = torch.sqrt(real * real + 4 * (n * k) ** 2)
-    larger = torch.sqrt(0.5 * (squared + real.abs()))  # of a and b; nothing cancels in it
+    larger = torch.sqrt(0.5 * (squared + real.abs()))  # the larger of a and b, which has no cancellation
     return c, sine2, torch.where(real >= 0, larger, n * k / larger), squared
 
 
 @for_arrays
 def conductor_reflectances(cosine: Tensor, n: Tensor, k: Tensor) -> tuple[Tensor, Tensor]:
-    """Power reflectances of a conductor from the cosine of the angle of incidence; see the module's text.
+    """Return power reflectances of a conductor for the cosine of the angle of incidence; see the module.
 
     Args:
         cosine: [...] cos(zenith); values outside [0, 1] are clamped.
@@ -290,9 +288,9 @@ def conductor_reflectances(cosine: Tensor, n: Tensor, k: Tensor) -> tuple[Tensor
 
 @for_arrays
 def conductor_dolp_slope(cosine: Tensor, n: Tensor, k: Tensor) -> Tensor:
-    """Degree of polarization of what a conductor reflects, divided by ``sin^2(zenith)``.
+    """Return the degree of polarization of a conductor's reflection over ``sin^2(zenith)``.
 
-    ``(Rs - Rp) / (Rs + Rp) = sin^2(i) y / x`` with x and y of the module's text. It is smooth at normal incidence,
+    ``(Rs - Rp) / (Rs + Rp) = sin^2(i) y / x`` with x and y defined in the module. It is smooth at normal incidence,
     where the direction of polarization is undefined (compare ``dolp_slopes``).
 
     Args:
@@ -308,17 +306,17 @@ def conductor_dolp_slope(cosine: Tensor, n: Tensor, k: Tensor) -> Tensor:
 
 @for_arrays
 def conductor_oblique_share(cosine: Tensor, n: Tensor, k: Tensor) -> Tensor:
-    """Share of the polarization at 45 degrees to the plane of incidence that reflection at a conductor keeps.
+    """Return the share of polarization at 45 degrees to the plane of incidence after reflection at a conductor.
 
-    It is the ratio of U / S0 after and before the reflection of light with U alone: ``2 Re(-rs rp*) / (|rs|^2 + |rp|^2)
-    = 1 - 2 sin^4(i) / x`` with x of the module's text. The rest becomes circular polarization.
+    It is the ratio of U / S0 after and before the reflection of light with U alone, ``1 - 2 sin^4(i) / x`` with x
+    defined in the module, from ``2 Re(-rs rp*) / (|rs|^2 + |rp|^2)``. The rest becomes circular polarization.
 
     Args:
         cosine: [...] cos(zenith); values outside [0, 1] are clamped.
         n, k: [...] of the index, n > 0, k >= 0.
 
     Returns:
-        [...] in [-1, 1]: 1 at normal incidence, negative beyond the principal angle of incidence.
+        [...] in [-1, 1]; 1 at normal incidence, negative beyond the principal angle of incidence.
     """
     c, sine2, _, squared = _terms(cosine, n, k)
     sine4 = sine2 * sine2
@@ -327,11 +325,11 @@ def conductor_oblique_share(cosine: Tensor, n: Tensor, k: Tensor) -> Tensor:
 
 @for_arrays
 def conductor_index(reflectance: Tensor) -> tuple[Tensor, Tensor]:
-    """An index (n, k) of a metal with this reflectance at normal incidence.
+    """Return an index (n, k) of a metal with a reflectance at normal incidence.
 
-    ``n = 2.1 - 1.9 r``, a line through copper, gold, silver, aluminum, chromium, iron, nickel and titanium, and the
-    ``k^2 = ((n + 1)^2 r - (n - 1)^2) / (1 - r)`` that then gives r (Gulbrandsen 2014, Eq. 2). Degrees of polarization
-    are right to 0.01 at 45 degrees, to 0.08 at 60 and to 0.4 beyond 70.
+    ``n = 2.1 - 1.9 r`` is a line through copper, gold, silver, aluminum, chromium, iron, nickel and titanium. For
+    this n, ``k^2 = ((n + 1)^2 r - (n - 1)^2) / (1 - r)`` gives r (Gulbrandsen 2014, Eq. 2). Degrees of polarization
+    have errors of 0.01 at 45 degrees, 0.08 at 60 degrees and 0.4 beyond 70 degrees.
 
     Args:
         reflectance: [...] at normal incidence, clamped to [0.1, 0.985].
@@ -346,11 +344,11 @@ def conductor_index(reflectance: Tensor) -> tuple[Tensor, Tensor]:
 
 @for_arrays
 def conductor(cosine: Tensor, reflectance: Tensor) -> tuple[Tensor, Tensor]:
-    """Reflectance for unpolarized light, ``(Rs + Rp) / 2``, and ``conductor_dolp_slope`` of a metal.
+    """Return the reflectance of a metal for unpolarized light, ``(Rs + Rp) / 2``, and its ``conductor_dolp_slope``.
 
     Args:
         cosine: [...] cos(zenith); values outside [0, 1] are clamped.
-        reflectance: [...] at normal incidence, as of ``conductor_index``.
+        reflectance: [...] at normal incidence, see ``conductor_index``.
 
     Returns:
         (R, rho / sin^2), each [...].

@@ -16,6 +16,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from polarguide.capture.angle_evidence import TO_DEVIATION
 from polarguide.capture.calibration import LARGEST_IMBALANCE, pair_ratio
 from polarguide.capture.colmap.model import read_model
 from polarguide.capture.colmap.poses import Geometry
@@ -82,10 +83,10 @@ from polarguide.preparation.source import DevelopedView, Source, Stored
 
 _JUDGED_VIEWS = 8
 _GAINS = {
-    "dark": "(I0 + I90)/(I45 + I135) is too dark to measure; not corrected.",
-    "off": "(I0 + I90)/(I45 + I135) is off by {:+.1%}, too much for gains; not corrected.",
+    "dark": "The pictures are too dark to measure (I0 + I90)/(I45 + I135). Gains are not corrected.",
+    "off": "(I0 + I90)/(I45 + I135) deviates from 1 by {:+.1%}, too much for gains. Gains are not corrected.",
 }
-# Bytes for each pixel of a shot: as stored and stacked, linear, aligned or turned, written.
+# Bytes per pixel of a shot: stored, stacked, linear, aligned or rotated, written.
 _WORKED = 3 * (2 + 2 + 4 + 4 + 4)
 
 
@@ -106,7 +107,7 @@ class ShotsMeasured(Measured, kw_only=True):
 
 
 class ShotsSource(Source):
-    """Shots of an ordinary camera through a polarizing filter: what four a view and single ones have in common."""
+    """Base of the sources of shots of an ordinary camera through a polarizing filter."""
 
     cameras = None
     measured_type = ShotsMeasured
@@ -115,7 +116,10 @@ class ShotsSource(Source):
     _root: Path
 
     def __init__(self, paths: list[Path], views: dict[str, list[Path]], settings: FilterSettings) -> None:
-        """Use the shots of each view, in their order; ``paths`` are all files that are read.
+        """Use the shots of each view in their order.
+
+        Args:
+            paths: all files that are read. views: shots by view. settings: settings of the preparation.
 
         Raises:
             PolarguideError: white balance or transfer do not fit the files.
@@ -145,29 +149,29 @@ class ShotsSource(Source):
         self._as_stored: frozenset[str] = frozenset()
 
     def stored(self, view: str) -> Stored:
-        """By the header of the view's first shot."""
+        """Return size and orientation from the header of the view's first shot."""
         first = self._of_view[view][0]
         if is_camera_raw(first):
             return Stored(*stored_frame(first))
         return Stored(stated_size(first), orientation(read_picture(first)))
 
     def lenses(self) -> dict[str, Lens]:
-        """By the EXIF tags of each view's first shot."""
+        """Return the lenses from the EXIF tags of each view's first shot."""
         return camera_groups({view: paths[0] for view, paths in self._of_view.items()})
 
     def use_stored(self, views: Collection[str]) -> None:
-        """Develop these views without turning them."""
+        """Develop these views without rotation."""
         self._as_stored = frozenset(views)
 
     def used_as_stored(self, view: str) -> bool:
-        """Whether a view is not turned, whatever its orientation tag."""
+        """Return True if a view is not rotated, regardless of its orientation tag."""
         return view in self._as_stored
 
     def _require_memory(self, what: str) -> None:
-        """Refuse shots of a view that do not fit into memory, by their headers alone; ``what`` is for messages.
+        """Refuse shots of a view that exceed the memory, by their headers alone; ``what`` is their name in messages.
 
         Raises:
-            PolarguideError: the largest is too large.
+            PolarguideError: the largest view is too large.
         """
         require_memory_of_each(
             self._shots,
@@ -177,11 +181,11 @@ class ShotsSource(Source):
         )
 
     def _angles(self, view: str) -> Sequence[Angle]:
-        """The angles of a view's pictures, as the user counts them."""
+        """Return the angles of a view's pictures, as stated."""
         return ANGLES
 
-    def _decided(self, levels: Levels | None) -> TransferDecision:
-        """The transfer of the capture: as given, or by a few views spread over it and what the files state."""
+    def _decide_transfer(self, levels: Levels | None) -> TransferDecision:
+        """Return the transfer function: as specified, or by a few views spread over the capture and by the files."""
         several = [view for view in self.views if len(self._of_view[view]) > 1]
         views = several[:: max(1, math.ceil(len(several) / _JUDGED_VIEWS))] or self.views[:1]
         decision = transfer_of_pictures(
@@ -196,7 +200,7 @@ class ShotsSource(Source):
         return decision
 
     def _rounding(self, transfer: str, smallest: float) -> tuple[tuple[int, int], ...]:
-        """Rounding of codes: by the steps of 8-bit values, which grow with sRGB's; none for 16 bits."""
+        """Return the rounding of codes: steps of 8-bit values, which grow with sRGB's; no rounding for 16 bits."""
         first = self._shots[:1]
         if self._settings.precision == "full" or read_stack(first, self._white).pictures.dtype != np.uint8:
             return tuple(EXACT)
@@ -206,17 +210,17 @@ class ShotsSource(Source):
         return tuple(rounding_of(FULL_CODE * smallest * levels))
 
     def _name(self, path: Path) -> str:
-        """A photograph's name in its folder."""
+        """Return a photograph's name in its folder."""
         return path.relative_to(self._root).as_posix()
 
     def _linear(self, view: str, measured: ShotsMeasured, *, align: bool) -> LinearShots:
-        """Return the linear shots of a view; four are aligned if ``align``."""
+        """Return the linear shots of a view, aligned if ``align`` is True."""
         shots = read_stack(self._of_view[view], self._white, measured.levels)
         if self.used_as_stored(view):
             shots = replace(shots, orientation=1)
         return LinearShots.of(shots, measured.transfer, align=align)
 
-    def _developed(
+    def _view(
         self,
         shots: LinearShots,
         upright: NDArray[np.float32],
@@ -225,7 +229,7 @@ class ShotsSource(Source):
         angles: Sequence[Angle] = ANGLES,
         **measurements: Any,
     ) -> DevelopedView:
-        """Return the view of pictures [K, H, W, 3] that are turned for display, with its record."""
+        """Return the view of pictures [K, H, W, 3] in display orientation, with its record."""
         height, width = upright.shape[1:3]
         return DevelopedView(
             intensities=np.ascontiguousarray(upright),
@@ -244,42 +248,39 @@ class ShotsSource(Source):
 
 
 class FilterSource(ShotsSource):
-    """Shots of an ordinary camera through a rotating linear polarizer."""
+    """Source of four shots per view through a rotating linear polarizer."""
 
     kind = "filter"
 
     def __init__(
         self, root: Path, settings: FilterSettings, shots: dict[str, dict[int, Path]] | None = None
     ) -> None:
-        """Use the shots of a folder: as their names say, or as given by view and angle."""
+        """Find the shots of a folder by their names, unless ``shots`` specifies them by view and angle."""
         self._root = root
         unused = [path.name for path in list_shots(root, nested=True)[1]] if shots is None else []
         shots = find_shots(root, nested=True) if shots is None else shots
         require_four_shots(root, shots)
         unused += [path.name for files in shots.values() for a, path in files.items() if a not in ANGLES]
         if unused:
-            fault = f"{root} has pictures without an angle in their names, or at other angles than 0, 45, 90 and 135"
-            warnings.warn(f"{fault}, which are not used ({listed(unused)}).", PolarguideWarning, stacklevel=2)
+            fault = f"{root} contains pictures without an angle in their names, or at other angles than 0, 45, 90, 135"
+            warnings.warn(f"{fault}. They are not used ({listed(unused)}).", PolarguideWarning, stacklevel=2)
         views = {view: [files[angle] for angle in ANGLES] for view, files in sorted(shots.items())}
         super().__init__([path for files in views.values() for path in files], views, settings)
 
     def measure(self, advance: Advance) -> ShotsMeasured:
-        """The transfer of the capture, from a few views spread over it."""
+        """Determine levels, transfer and exposures of the capture."""
         self._require_memory("four shots")
         settings = self._settings
         gains = settings.calibration.gains
-        notes = [*self.assumed]
-        levels, counted = levels_of_pictures(self._shots, self._white, self._settings)
-        decision = self._decided(levels)
-        notes += [*counted, decision.note]
+        levels, level_notes = levels_of_pictures(self._shots, self._white, self._settings)
+        decision = self._decide_transfer(levels)
         stated, missing = stated_exposures(self._of_view, advance) if settings.gains != "none" else ({}, "")
-        notes += [missing] if missing else exposure_notes(stated)
-        # One scale for all shots, with room for the largest gain that is corrected.
-        room = math.sqrt(1.0 - LARGEST_IMBALANCE)
-        scale = min(1.0, *gains) if gains is not None else room if settings.gains == "auto" else 1.0
+        # One scale for all shots, with headroom for the largest gain that is corrected.
+        headroom = math.sqrt(1.0 - LARGEST_IMBALANCE)
+        scale = min(1.0, *gains) if gains is not None else headroom if settings.gains == "auto" else 1.0
         scale /= settings.calibration.peak
-        smallest = scale / (max(gains) if gains is not None else 1.0 / room)
-        every = [value for of_view in stated.values() for value in of_view] or [1.0]
+        smallest = scale / (max(gains) if gains is not None else 1.0 / headroom)
+        every = [value for values in stated.values() for value in values] or [1.0]
         return ShotsMeasured(
             transfer="srgb" if decision.transfer == "srgb" else "linear",
             scale=scale * min(1.0, *every),
@@ -290,11 +291,16 @@ class FilterSource(ShotsSource):
                 for view, values in stated.items()
                 for path, value in zip(self._of_view[view], values, strict=True)
             },
-            notes=notes,
+            notes=[
+                *self.assumed,
+                *level_notes,
+                decision.note,
+                *([missing] if missing else exposure_notes(stated)),
+            ],
         )
 
     def develop(self, view: str, measured: ShotsMeasured) -> DevelopedView:
-        """Read the four shots: validity, transfer, shifts, exposures, gains, the sense of the angles, then the turn."""
+        """Develop the four shots: validity, transfer, shifts, exposures, gains, sense of the angles, orientation."""
         settings = self._settings
         shots = self._linear(view, measured, align=settings.align)
         paths = self._of_view[view]
@@ -304,15 +310,15 @@ class FilterSource(ShotsSource):
             warnings.warn(f"{view}: {warning}", PolarguideWarning, stacklevel=2)
         invalid = shots.invalid
         ratio = pair_ratio(linear.mean(axis=3), ~invalid)
-        gains, why = pair_gains(ratio, settings, _GAINS if settings.gains == "auto" else {})
-        # A shot that the pair sums brighten beyond what its file states may exceed full scale: it counts as clipped.
+        gains, notes = pair_gains(ratio, settings, _GAINS if settings.gains == "auto" else {})
+        # Measured gains can exceed the stated ones. Values above full scale then count as clipped.
         linear = linear * np.asarray(measured.scale / np.asarray(gains), np.float32)[:, None, None, None]
         invalid = invalid | (linear > 1.0).any(axis=(0, 3))
-        return self._developed(
+        return self._view(
             shots,
             as_displayed(np.minimum(linear, 1.0), settings.calibration, shots.orientation),
             invalid,
-            [*shift_notes(view, shots.shifts), *(f"{view}: {note}" for note in why)],
+            [*shift_notes(view, shots.shifts), *(f"{view}: {note}" for note in notes)],
             shifts=[(shift.x, shift.y) for shift in shots.shifts],
             warps=[shift.warp for shift in shots.shifts],
             shifts_corrected=[shift.corrected for shift in shots.shifts],
@@ -323,7 +329,7 @@ class FilterSource(ShotsSource):
 
 
 class SinglesSource(ShotsSource):
-    """Photographs of one camera through a linear polarizer that was turned between them, or without one."""
+    """Source of photographs through a linear polarizer at any angles, or without one."""
 
     kind = "singles"
 
@@ -331,32 +337,31 @@ class SinglesSource(ShotsSource):
         """Find the photographs and their angles.
 
         Raises:
-            PolarguideError: one has no angle, or the settings do not fit the files.
+            PolarguideError: a photograph has no angle, or the settings do not fit the files.
         """
         shots, tables = find_single_shots(root, settings.angles, settings.shots_per_view or 1)
         self._root = root
         self._singles: dict[str, list[SingleShot]] = {}
         for shot in shots:
             self._singles.setdefault(shot.view, []).append(shot)
-        of_view = {view: [shot.path for shot in mine] for view, mine in sorted(self._singles.items())}
-        paths = [path for mine in of_view.values() for path in mine]
-        super().__init__([*paths, *tables], of_view, settings)
+        files = {view: [shot.path for shot in group] for view, group in sorted(self._singles.items())}
+        super().__init__([*itertools.chain(*files.values()), *tables], files, settings)
 
     def measure(self, advance: Advance) -> ShotsMeasured:
-        """The transfer, and what the files say about their exposure.
+        """Determine levels, transfer and stated exposures of the capture.
 
         Raises:
-            PolarguideError: the photographs are too large, or not of one size.
+            PolarguideError: the photographs are too large, or have different sizes.
         """
         self._require_memory("photographs of a view")
         stated_sizes = ((stated_size(path), path) for path in self._shots if not is_camera_raw(path))
-        # Width and height may be exchanged by the side that the camera was held on.
+        # Portrait and landscape pictures exchange width and height.
         sizes = ((f"{max(size)}x{min(size)}", path) for size, path in stated_sizes if size is not None)
         require_one(
             self._root,
             sizes,
             "photographs of one size",
-            "Export all pictures of one camera alike, without a crop.",
+            "Export all pictures of one camera with the same settings, without a crop.",
         )
         require_one(
             self._root,
@@ -364,8 +369,8 @@ class SinglesSource(ShotsSource):
             "photographs of one kind of file",
             COMPARABLE,
         )
-        levels, counted = levels_of_pictures(self._shots, self._white, self._settings)
-        decision = self._decided(levels)
+        levels, level_notes = levels_of_pictures(self._shots, self._white, self._settings)
+        decision = self._decide_transfer(levels)
         stated, missing = light_of_files(self._of_view, advance)
         light = {self._name(path): value for path, value in stated.items()}
         stating = f"{'All' if light else 'None'} of {len(self._shots)} files state their exposure (EXIF)."
@@ -375,11 +380,11 @@ class SinglesSource(ShotsSource):
             rounding=self._rounding(decision.transfer, 1.0),
             levels=levels,
             light=light,
-            notes=[*self.assumed, self._summary(), decision.note, *counted, missing or stating],
+            notes=[*self.assumed, self._summary(), decision.note, *level_notes, missing or stating],
         )
 
     def develop(self, view: str, measured: ShotsMeasured) -> DevelopedView:
-        """Read the shots of a view: validity, transfer, shifts of the usual four, the turn of pictures and angles."""
+        """Develop the shots of a view: validity, transfer, shifts of the usual four angles, then orientation."""
         settings = self._settings
         singles = self._singles[view]
         usual = [shot.angle for shot in singles] == list(ANGLES)
@@ -391,7 +396,7 @@ class SinglesSource(ShotsSource):
             for shot, angle in zip(singles, angles, strict=True)
         ]
         upright = np.stack([apply_orientation(picture, shots.orientation) for picture in shots.values])
-        return self._developed(
+        return self._view(
             shots,
             upright,
             shots.invalid,
@@ -404,7 +409,7 @@ class SinglesSource(ShotsSource):
         return [shot.angle for shot in self._singles[view]]
 
     def _summary(self) -> str:
-        """How many photographs there are, and at which angles."""
+        """Return a note on the number of photographs and their angles."""
         counts: Counter[Angle] = Counter()
         for shot in itertools.chain(*self._singles.values()):
             angle = turned(shot.angle, self._settings.calibration)
@@ -417,25 +422,25 @@ class SinglesSource(ShotsSource):
             (unknown, "at unknown angles"),
             (bare, "without a filter"),
         )
-        kinds = ", ".join(f"{count} {what}" for count, what in parts if count)
+        kinds = ", ".join(f"{count} {kind}" for count, kind in parts if count)
         return f"{len(self._shots)} photographs of {len(self.views)} views: {kinds}."
 
 
 Array = NDArray[np.floating[Any]]
 FILE_ERROR = 0.03
-"""Relative error of exposures that files state: shutters and apertures have nominal values."""
+"""Relative error of exposures that files state, because shutters and apertures have nominal values."""
 POINTS_ERROR = 0.05
-"""Relative error of exposures from points, at least: reflections move, and polarization is taken for exposure."""
+"""Smallest relative error of exposures from points, because reflections move and polarization looks like exposure."""
 LARGEST_DOUBT = 0.5
-"""Logarithm of 0.7 stops: points that contradict a file by more, and by more than others do, are believed."""
+"""Logarithm of 0.7 stops. Points that contradict a file by more, and by more than others do, take precedence."""
 
 
 @dataclass(frozen=True, eq=False)
 class Exposures:
-    """Exposures of pictures, and how well their sources agree.
+    """Exposures of pictures, and the agreement of their sources.
 
     Attributes:
-        logs: logarithms, [N], on an arbitrary common constant; NaN where nothing is known.
+        logs: logarithms [N] up to a common constant; NaN if unknown.
         contradicted: indices of pictures whose points contradict their file.
         scatter: robust standard deviation of the differences between points and files; None without both.
     """
@@ -448,24 +453,26 @@ class Exposures:
 def reconciled(
     points: Array, files: Array, unfiltered: NDArray[np.bool_], errors: Array | None = None
 ) -> Exposures:
-    """Exposures from those of points and those of files.
+    """Combine the exposures of points and files.
 
     Small differences correct the file's value, within its usual error (``FILE_ERROR``) and the agreement of points and
-    files in this capture. Large ones are taken as errors of the points, unless they exceed ``LARGEST_DOUBT``: then the
-    points count. A filter takes the same share of the light from all pictures behind it, which the points tell.
+    files in this capture. Large ones count as errors of the points, unless they exceed ``LARGEST_DOUBT``. Then the
+    points take precedence. The filter absorbs the same share of light in all pictures, which the points determine.
 
     Args:
-        points, files: logarithms, [N]; NaN where one is not known.
-        unfiltered: [N] whether a picture was taken without a filter.
-        errors: of those of points, [N]; differences that are not significant count as none.
+        points, files: logarithms, [N]; NaN if unknown.
+        unfiltered: mask [N] of pictures without a filter.
+        errors: standard errors of ``points``, [N]; insignificant differences count as 0.
     """
     errors = np.zeros(len(points)) if errors is None else errors
-    files = files + np.where(unfiltered, np.log(2.0), 0.0)  # an ideal filter leaves half of unpolarized light
+    files = files + np.where(
+        unfiltered, np.log(2.0), 0.0
+    )  # an ideal filter transmits half of unpolarized light
     both = np.isfinite(points) & np.isfinite(files)
     if both.sum() < 3:
-        sure = np.where(significant(np.abs(points), errors), points, 0.0)
-        sure = np.where(np.isfinite(points), sure, np.nan)
-        aligned = sure + (np.median((files - points)[both]) if both.any() else 0.0)
+        certain = np.where(significant(np.abs(points), errors), points, 0.0)
+        certain = np.where(np.isfinite(points), certain, np.nan)
+        aligned = certain + (np.median((files - points)[both]) if both.any() else 0.0)
         return Exposures(np.where(np.isfinite(files), files, aligned), (), None)
     shifted = files + np.median((points - files)[both])
     for group in (unfiltered, ~unfiltered):
@@ -473,7 +480,7 @@ def reconciled(
             shifted = np.where(group, files + np.median((points - files)[group & both]), shifted)
     difference = np.where(both, points - shifted, 0.0)
     difference = np.where(significant(np.abs(difference), errors), difference, 0.0)
-    scatter = 1.4826 * float(np.median(np.abs(difference[both])))
+    scatter = TO_DEVIATION * float(np.median(np.abs(difference[both])))
     weight = FILE_ERROR**2 / (FILE_ERROR**2 + max(scatter, POINTS_ERROR) ** 2)
     odd = both & (np.abs(difference) > max(LARGEST_DOUBT, 4 * scatter))
     correction = weight * difference / (1 + (difference / (3 * FILE_ERROR)) ** 2)
@@ -483,7 +490,7 @@ def reconciled(
     return Exposures(logs, tuple(int(k) for k in np.flatnonzero(odd)), scatter)
 
 
-# Logarithm of a gain that is warned of where files do not state it: one and a half stops from the others.
+# Logarithm of a gain that differs from the others by one and a half stops. It gets a warning if files do not state it.
 _FAR = math.log(2.0) * 1.5
 _LISTED = 12
 
@@ -493,9 +500,9 @@ class PictureRow:
     """A picture of the scene.
 
     Attributes:
-        view, file: its view, and its name in ``polar/``.
+        view: its view. file: its name in ``polar/``.
         record: its record in ``scene.json``.
-        points: how many points its view was compared at.
+        points: number of points at which its view was compared.
         log: logarithm of its gain.
     """
 
@@ -509,15 +516,15 @@ class PictureRow:
 def write_exposure_table(
     root: Path, views: Mapping[str, ViewRecord], gains: str, *, posed: bool, reporter: Reporter
 ) -> None:
-    """Estimate the gain of every picture of a written scene, note it with the views, and write ``angles.csv``.
+    """Estimate the gains of all pictures of a written scene, add them to the records, and write ``angles.csv``.
 
-    Shots of one view share one exposure, but for what their files say. Gains that the user gave stay, and the others
-    fit them; without any, the geometric mean is 1.
+    Shots of one view share one exposure, except for differences that their files state. Gains from the user are kept,
+    and the other gains are scaled to fit them. Otherwise, the geometric mean is 1.
 
     Args:
-        root: folder of the scene, with all views written, and the model if there is one. views: its views.
-        gains: auto by the files and, with a model, by points; exif by the files alone; none for 1, or as given.
-        posed: whether there is a model.
+        root: folder of the scene with all views, and the model if there is one. views: its views.
+        gains: auto uses files and, with a model, points; exif uses files only; none sets 1, or keeps stated gains.
+        posed: True with a model.
         reporter: for messages.
     """
     pictures = [
@@ -543,8 +550,8 @@ def write_exposure_table(
     for picture in pictures:
         picture.record.gain = float(f"{math.exp(picture.log):.6g}")
         picture.record.points = picture.points
-    _tell(pictures, reporter)
-    # Files are named exactly, as they are read again.
+    _say_table(pictures, reporter)
+    # Names are not escaped, because the table is read again.
     rows = [(p.file, p.view, angle_text(p.record.angle), f"{p.record.gain:.6g}") for p in pictures]
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows([("file", "view", "angle", "gain"), *rows])
@@ -552,65 +559,56 @@ def write_exposure_table(
 
 
 def _estimate(root: Path, pictures: list[PictureRow], posed: bool, reporter: Reporter) -> None:
-    """Gains of all pictures, from points in common and what the files say."""
+    """Estimate the gains of all pictures from shared points and stated exposures."""
     views = list(dict.fromkeys(picture.view for picture in pictures))
-    noted = [picture.record.light for picture in pictures]
-    files = np.log(np.array([math.nan if light is None else light for light in noted], np.float64))
+    stated = [picture.record.light for picture in pictures]
+    files = np.log(np.array([math.nan if light is None else light for light in stated], np.float64))
     within = _within_views(pictures, files)
     rows = {view: [k for k, picture in enumerate(pictures) if picture.view == view] for view in views}
     points = np.full(len(views), math.nan)
     numbers = np.zeros(len(views), np.int64)
     errors = np.full(len(views), math.inf)
-    compared = _of_points(root, pictures, rows, within, reporter) if posed and len(views) > 1 else None
+    compared = _compare_points(root, pictures, rows, within, reporter) if posed and len(views) > 1 else None
     if compared is not None:
         points = compared.logs[:, 0]
         numbers = compared.points
         errors = compared.errors
     of_view = np.array([float(np.mean((files - within)[rows[view]])) for view in views])
-    # Views that were photographed both ways: whatever the shots are compared at, most of it passed the filter.
+    # Views with and without a filter: most of their light passed the filter.
     bare = np.array([all(pictures[k].record.angle == "none" for k in rows[view]) for view in views])
     estimate = reconciled(points, of_view, bare, errors)
-    lost = [view for view, log in zip(views, estimate.logs, strict=True) if not math.isfinite(log)]
-    middle = float(np.nanmean(estimate.logs)) if len(lost) < len(views) else 0.0
+    finite = np.isfinite(estimate.logs)
+    logs = np.where(finite, estimate.logs, np.nanmean(estimate.logs) if finite.any() else 0.0)
     for place, view in enumerate(views):
-        log = estimate.logs[place] if math.isfinite(estimate.logs[place]) else middle
         for k in rows[view]:
-            pictures[k].log = float(log + within[k])
+            pictures[k].log = float(logs[place] + within[k])
             pictures[k].points = int(numbers[place])
-    _say_how(
-        views,
-        points,
-        of_view,
-        estimate.scatter,
-        lost,
-        None if compared is None else compared.significant[:, 0],
-        errors,
-        reporter,
-    )
+    unknown = [view for view, is_finite in zip(views, finite, strict=True) if not is_finite]
+    _say_origin(of_view, estimate.scatter, compared, unknown, reporter)
     _warn([views[k] for k in estimate.contradicted], pictures, of_view, reporter)
 
 
 def _within_views(pictures: list[PictureRow], files: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Logarithms of exposures relative to the mean of their view, as the files say; 0 where not all of them do."""
+    """Return logarithms of stated exposures relative to the mean of their view; 0 if a file states none."""
     relative = np.zeros(len(pictures))
     for view in {picture.view for picture in pictures}:
         places = [k for k, picture in enumerate(pictures) if picture.view == view]
         bare = np.array([pictures[k].record.angle == "none" for k in places])
-        # Beside shots through the filter, one without gets twice the light at the same exposure.
+        # Compared with a shot through the filter, a shot without it gets twice the light at the same exposure.
         extra = np.where(bare & (not bare.all()), math.log(2.0), 0.0)
         logs = files[places] + extra if np.isfinite(files[places]).all() else extra
         relative[places] = logs - logs.mean()
     return relative
 
 
-def _of_points(
+def _compare_points(
     root: Path,
     pictures: list[PictureRow],
     rows: dict[str, list[int]],
     within: NDArray[np.float64],
     reporter: Reporter,
 ) -> PointExposures | None:
-    """Exposures of views by the model's points; None where no tracks are stored."""
+    """Estimate exposures of views by the model's points; None without tracks."""
     model = read_model(root)
     views = list(rows)
     compared = ComparedPoints.of(model, views)
@@ -632,65 +630,73 @@ def _of_points(
     return exposures_of_points(values, compared.places)
 
 
-def _say_how(
-    views: list[str],
-    points: NDArray[np.float64],
+def _say_origin(
     files: NDArray[np.float64],
     scatter: float | None,
-    lost: list[str],
-    gains: Array | None,
-    errors: Array,
+    compared: PointExposures | None,
+    unknown: list[str],
     reporter: Reporter,
 ) -> None:
-    """Where the gains come from."""
-    by_points = int(np.isfinite(points).sum())
+    """Print the origin of the gains.
+
+    Args:
+        files: logarithms of the exposures of the views that files state, [V]; NaN if they state none.
+        scatter: standard deviation of the differences between points and files, or None.
+        compared: exposures by points, or None.
+        unknown: views without a known exposure.
+        reporter: for messages.
+    """
+    count = len(files)
+    by_points = 0 if compared is None else int(np.isfinite(compared.logs[:, 0]).sum())
     by_files = int(np.isfinite(files).sum())
     if scatter is not None:
-        origin = f"Gains: exposures that the files state, and points in common ({by_points} of {len(views)} views); "
-        reporter.say(f"{origin}the two differ by {scatter:.1%} (robust standard deviation).")
-    elif gains is not None and by_points:
+        reporter.say(
+            f"Gains: exposures that the files state, and shared points ({by_points} of {count} views). The two differ "
+            f"by {scatter:.1%} (robust standard deviation)."
+        )
+    elif compared is not None and by_points:
+        gains = compared.significant[:, 0]
         applied = int(np.count_nonzero(np.nan_to_num(gains)))
-        usual = float(np.median(errors))
-        significance = f"They do not differ significantly (error {usual:.0%}): none is applied."
+        error = float(np.median(compared.errors))
+        significance = f"They do not differ significantly (error {error:.0%}) and are not applied."
         if applied:
             known = int(np.isfinite(gains).sum())
             significance = (
-                f"{known - applied} of {known} are not significant (error {usual:.0%}) and not applied."
+                f"{known - applied} of {known} are not significant (error {error:.0%}) and not applied."
             )
         reporter.say(
-            f"Gains: from points in common ({by_points} of {len(views)} views); the files do not state exposures. "
+            f"Gains: from shared points ({by_points} of {count} views). The files do not state exposures. "
             f"{significance}"
         )
     elif by_files:
-        reporter.say(f"Gains: exposures that the files state ({by_files} of {len(views)} views).")
-    if lost:
+        reporter.say(f"Gains: exposures that the files state ({by_files} of {count} views).")
+    if unknown:
         reporter.warn(
-            f"The gains of {len(lost)} of {len(views)} views are not known ({listed(lost)}): their files state no "
-            f"exposure, and fewer than {FEWEST} points tell it. They are taken for average; {TABLE} may say better."
+            f"The gains of {len(unknown)} of {count} views are unknown ({listed(unknown)}): their files state no "
+            f"exposure, and they have fewer than {FEWEST} points. The mean is assumed; {TABLE} can state their gains."
         )
 
 
 def _warn(
     contradicted: list[str], pictures: list[PictureRow], files: NDArray[np.float64], reporter: Reporter
 ) -> None:
-    """Name exposures that are out of the ordinary."""
+    """Warn about unusual exposures."""
     if contradicted:
         reporter.warn(
-            f"{len(contradicted)} views are brighter or darker than the exposure in their files says "
-            f"({listed(contradicted)}); the brightness of shared points is used instead. Was a filter taken off, "
-            "or a picture edited?"
+            f"The brightness of shared points in {len(contradicted)} views contradicts the exposure in their files "
+            f"({listed(contradicted)}) and is used instead. Was a filter removed, or a picture edited?"
         )
     if not np.isfinite(files).any():
         logs = np.array([picture.log for picture in pictures])
         far = [p.file for p in pictures if abs(p.log - float(np.median(logs))) > _FAR]
         if far:
             reporter.warn(
-                f"{len(far)} pictures are exposed by more than 1.5 stops differently ({listed(far)})."
+                f"The exposures of {len(far)} pictures differ from the others by more than 1.5 stops ({listed(far)})."
             )
 
 
-def _tell(pictures: list[PictureRow], reporter: Reporter) -> None:
-    """Print the table: all pictures, or the most unusual ones of many; nothing where all gains are 1."""
+def _say_table(pictures: list[PictureRow], reporter: Reporter) -> None:
+    """Print the table: all pictures, or the most unusual of many; nothing if all gains are 1."""
     if all(picture.record.gain == 1 for picture in pictures):
         return
     listing = pictures
@@ -706,5 +712,5 @@ def _tell(pictures: list[PictureRow], reporter: Reporter) -> None:
         stops = f"{math.log2(gain):+.2f}"
         rows.append(f"{picture.file:<{width}} {angle:>7} {gain:>7.3f} {stops:>6} {picture.points:>7}")
     if len(listing) < len(pictures):
-        rows.append(f"... and {len(pictures) - len(listing)} nearer to the mean; {TABLE} has all.")
+        rows.append(f"... and {len(pictures) - len(listing)} closer to the mean; {TABLE} lists all.")
     reporter.say("\n".join(rows))

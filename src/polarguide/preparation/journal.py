@@ -1,6 +1,6 @@
-"""The record that a preparation keeps in ``prepare.json``, and at its end in ``scene.json``.
+"""Record of a preparation, in ``prepare.json`` and at the end in ``scene.json``.
 
-Files are identified by their content: times and paths change where files are copied, synchronized or moved.
+Files are identified by their content, because copies, synchronization and moves change times and paths.
 """
 
 from __future__ import annotations
@@ -24,7 +24,9 @@ from polarguide.core.records import read_record
 from polarguide.core.text import canonical
 
 Factor = Annotated[float, Meta(gt=0, le=1e12)]
-_Four = tuple[Factor, Factor, Factor, Factor]
+"""Positive factor."""
+"""Positive factor."""
+FourFactors = tuple[Factor, Factor, Factor, Factor]
 _Code = Annotated[int, Meta(ge=0, le=FULL_CODE)]
 _Multiple = tuple[_Code, Annotated[int, Meta(ge=1, le=FULL_CODE)]]
 StoredRounding = Annotated[tuple[_Multiple, ...], Meta(min_length=1)]
@@ -58,6 +60,13 @@ class ExposureRecord(msgspec.Struct):
     points: int | UnsetType = UNSET
 
 
+class WarpRecord(msgspec.Struct):
+    """Removal of the distortion of a camera: COLMAP's camera model and its parameters."""
+
+    model: str
+    parameters: list[float]
+
+
 class ViewRecord(msgspec.Struct, kw_only=True):
     """Record of a developed view. Fields that its kind of source does not measure are unset."""
 
@@ -74,7 +83,7 @@ class ViewRecord(msgspec.Struct, kw_only=True):
     negative_share: float | UnsetType = UNSET
     invalid_share: float | UnsetType = UNSET
     geometry: Geometry
-    warp: Any = None
+    warp: WarpRecord | None = None
     files: dict[str, int] = {}
 
     @property
@@ -87,7 +96,7 @@ class FileStamp(msgspec.Struct, frozen=True, array_like=True):
     """Identity of a file.
 
     Attributes:
-        size: bytes. time: of its last change (ns); the digest of a file with an equal time is not computed again.
+        size: bytes. time: of its last change (ns); a file with an equal time keeps its digest.
         digest: SHA-256 of its content; empty in records of earlier versions.
     """
 
@@ -130,7 +139,7 @@ class Journal(msgspec.Struct, Generic[M]):
 
 _BLOCK = 1 << 20
 _PATHS = ("dark_frame", "analyzers", "angles", "poses", "masks")
-"""Settings that may be paths; the files there are among those of the request."""
+"""Settings that may be paths. Their files are among those of the request."""
 
 
 def request_of(
@@ -145,13 +154,13 @@ def request_of(
 
     Args:
         root: folder of the capture.
-        earlier: records of earlier calls, which hold digests of files that have not changed since.
+        earlier: records of earlier calls, which hold digests of unchanged files.
         kind: format. settings: settings as JSON.
-        paths: files that are read; missing ones are left out. model: files of the poses.
+        paths: files that are read; missing ones are skipped. model: files of the poses.
     """
     known: Mapping[str, Mapping[str, FileStamp]] = {}
     for record in earlier:
-        with contextlib.suppress(PolarguideError):  # ``SceneFolder`` reports the error
+        with contextlib.suppress(PolarguideError):  # ``SceneFolder`` reports it
             request = read_record(record, Journal[Any]).prepare.request
             known = {"file": request.file, "model": request.model}
             break
@@ -187,7 +196,7 @@ def _stamps(files: Mapping[str, Path], known: Mapping[str, FileStamp]) -> dict[s
 
 
 def _digest(path: Path) -> str:
-    """Return the SHA-256 of a file; "" of a pipe, a device or an unreadable file, which its reader refuses."""
+    """Return the SHA-256 of a file; "" for a pipe, a device or an unreadable file, which its reader refuses."""
     digest = hashlib.sha256()
     if not path.is_file():
         return ""
@@ -203,7 +212,7 @@ def _digest(path: Path) -> str:
 def changed_entry(before: Request, now: Request) -> tuple[str, str, str] | None:
     """Return name, old and new value of the first difference between two requests; None for equal ones.
 
-    The places of files make no difference.
+    Locations of files do not matter.
     """
     for part in ("file", "format", "model"):
         old = getattr(before, part)
@@ -216,8 +225,8 @@ def changed_entry(before: Request, now: Request) -> tuple[str, str, str] | None:
         old, new = (_comparable(files, digests=digests) for files in (old, new))
         for key in sorted(old.keys() | new.keys()):
             if old.get(key) != new.get(key):
-                happened = "removed" if key not in new else "changed" if key in old else "added"
-                return f"{part} {key}", "as it was", f"that was {happened}"
+                change = "removed" if key not in new else "changed" if key in old else "added"
+                return f"{part} {key}", "as it was", f"that was {change}"
     for key in sorted(before.settings.keys() | now.settings.keys()):
         values = [settings.get(key) for settings in (before.settings, now.settings)]
         paths = [key in _PATHS and isinstance(value, str) and os.path.isabs(value) for value in values]

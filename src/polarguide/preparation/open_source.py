@@ -1,5 +1,6 @@
-"""Detect the format of a folder, and the origin of its poses: whether they are of the pictures as stored, or as EXIF
-turns them for display.
+"""Detection of the format of a source, and the origin and orientation of its poses.
+
+Poses refer to the pictures as stored, or to the pictures that EXIF orientation rotates for display.
 """
 
 from __future__ import annotations
@@ -45,20 +46,20 @@ from polarguide.preparation.settings import (
 from polarguide.preparation.source import MosaicSource, Source, StokesSource
 
 
-def _found_masks(folder: Path, views: Sequence[str]) -> dict[str, Path]:
+def _find_masks(folder: Path, views: Sequence[str]) -> dict[str, Path]:
     """Return the object masks of a folder by view.
 
-    Masks are named like views, or as COLMAP and Metashape name them (``cup.jpg.png``, ``cup_mask.png``).
+    Masks are named like views, or as in COLMAP and Metashape (``cup.jpg.png``, ``cup_mask.png``).
 
     Raises:
-        PolarguideError: there is no such folder, or none of its pictures is named like a view.
+        PolarguideError: the folder does not exist, or contains no picture with the name of a view.
     """
     if not folder.is_dir():
         raise PolarguideError(
             "--masks",
             expected="a folder of masks named like the views",
             found=f"{folder}, which is not a folder",
-            remedy="Give the folder that holds <view>.png.",
+            remedy="Specify the folder that contains <view>.png.",
         )
     files = sorted(folder.iterdir())
     masks: dict[str, Path] = {}
@@ -72,21 +73,21 @@ def _found_masks(folder: Path, views: Sequence[str]) -> dict[str, Path]:
             folder,
             expected=f"masks named like the views ({listed(list(views), 3)})",
             found=listed([path.name for path in files], 3) or "no file",
-            remedy="Rename them; views without a mask are used whole.",
+            remedy="Rename them. Views without a mask are used completely.",
         )
     return masks
 
 
 def open_source(root: Path, settings: PrepareSettings) -> Source:
-    """Open the pictures in a folder, in the given or detected format.
+    """Open the pictures in a folder, in the specified or detected format.
 
     Raises:
-        PolarguideError: there is no such folder, or nothing in it that can be read.
+        PolarguideError: the folder does not exist, or contains no readable picture.
     """
     require_folder(
         root,
         expected="a folder of camera files",
-        remedy="Give the folder that holds the raw mosaics, or the shots through the filter.",
+        remedy="Specify the folder that contains the raw mosaics, or the shots through the filter.",
     )
     kind: str = settings.format
     settings, shots, assumed = _consecutive(root, settings)
@@ -117,13 +118,13 @@ def open_source(root: Path, settings: PrepareSettings) -> Source:
             remedy="See docs/reference/formats.md for the layouts.",
         )
     if settings.masks is not None:
-        source.masks = _found_masks(settings.masks, source.views)
+        source.masks = _find_masks(settings.masks, source.views)
     return source
 
 
 _ORDINARY = (
-    "Nothing tells of a filter: the pictures are taken as ordinary photographs (--angles none). For shots through one: "
-    "--angles unknown, or name their angles."
+    "No angles are stated: the pictures are read as ordinary photographs (--angles none). For shots through a filter, "
+    "use --angles unknown, or state their angles."
 )
 Shots = dict[str, dict[int, Path]]
 
@@ -131,63 +132,63 @@ Shots = dict[str, dict[int, Path]]
 def _consecutive(
     root: Path, settings: PrepareSettings
 ) -> tuple[PrepareSettings, Shots | None, tuple[str, ...]]:
-    """Which consecutive pictures are one view, as ``--shots-per-view`` says or as they show.
+    """Group consecutive pictures into views, by ``--shots-per-view`` or by their content.
 
     Returns:
-        The settings, with the number of shots where it was found; where they are the usual four angles, the shots by
-        view and angle; and what was taken for granted, for the user.
+        The settings, including a detected number of shots; the shots by view and angle if the angles are the usual
+        four, else None; and notes on assumptions for the user.
 
     Raises:
-        PolarguideError: the pictures come in groups of another number than there are angles.
+        PolarguideError: the size of the groups differs from the number of angles.
     """
     angles = settings.angles
     if angles is None or angles == "none" or angles.lower().endswith(".csv"):
         return settings, None, ()
     stated = [parse_angle(part) for part in angles.split(",")]
     files = list(index_files(root, SHOT_SUFFIXES).values())
-    said: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
     each = settings.shots_per_view
     if each is None and (each := shots_of_one_place(files)) is not None:
         if len(stated) not in (1, each):
             raise PolarguideError(
                 "--angles",
-                expected=f"{each} angles, because {each} pictures each in a row show one place",
+                expected=f"{each} angles, because groups of {each} consecutive pictures show one place",
                 found=angles,
-                remedy="Correct them, or give --shots-per-view 1 if every picture is a view of its own.",
+                remedy="Correct them, or use --shots-per-view 1 if every picture is a view of its own.",
             )
-        alone = "--shots-per-view 1 takes every picture alone"
-        said = (
-            f"{each} pictures each in a row show one place and are one view, called like the first ({alone}).",
+        notes = (
+            f"Groups of {each} consecutive pictures show one place. Each is one view, named like its first picture "
+            "(--shots-per-view 1 makes a view of every picture).",
         )
         settings = replace(settings, shots_per_view=each)
     elif each is None and len(stated) > 1:
-        said = (
-            f"Every picture is a view of its own. If {len(stated)} in a row are one view: --shots-per-view "
-            f"{len(stated)}.",
+        count = len(stated)
+        notes = (
+            f"Every picture is a view of its own. If {count} consecutive pictures are one view, use --shots-per-view "
+            f"{count}.",
         )
-    usual = each == len(ANGLES) and sorted(stated, key=str) == sorted(map(float, ANGLES), key=str)
+    four = [angle for angle in stated if isinstance(angle, float)]
+    usual = len(four) == len(stated) == each and sorted(four) == list(ANGLES)
     if not usual or len(files) % len(ANGLES):
-        return settings, None, said
+        return settings, None, notes
     shots: Shots = {}
     for number, path in enumerate(files):
-        angle = stated[number % len(ANGLES)]
-        assert isinstance(angle, float)
-        shots.setdefault(files[number - number % len(ANGLES)].stem, {})[round(angle)] = path
-    return settings, shots, said
+        place = number % len(ANGLES)
+        shots.setdefault(files[number - place].stem, {})[round(four[place])] = path
+    return settings, shots, notes
 
 
 def _require_photographs(root: Path) -> None:
-    """Refuse pictures without angles in their names that may be something else than ordinary photographs.
+    """Refuse pictures without angles in their names that may not be ordinary photographs.
 
     Raises:
-        PolarguideError: there are raw mosaics, gray pictures (which may be mosaics) or none; or pictures are numbered
-            like angles, or show one place in a row, as shots through a filter do.
+        PolarguideError: the folder contains raw mosaics, gray pictures or no picture; pictures have numbers like
+            angles; or consecutive pictures show one place.
     """
     files = list(index_files(root, SHOT_SUFFIXES).values())
     if not files or index_files(root, tuple(set(RAW_SUFFIXES) - set(SHOT_SUFFIXES))):
         raise _unknown_layout(root)
-    # Raw mosaics are gray.
-    gray = []
+    gray = []  # raw mosaics are gray
     for path in (files[0], files[-1]):
         if path.suffix.lower() in RAW_SUFFIXES:
             pixels = decode_picture(path, read_picture(path))
@@ -196,7 +197,7 @@ def _require_photographs(root: Path) -> None:
     if gray:
         raise PolarguideError(
             root,
-            expected="photographs in color, or an option that says what gray pictures are",
+            expected="photographs in color, or an option for gray pictures",
             found=f"{gray[0]}, which is gray",
             remedy=f"Raw mosaics: --sensor, one of {SENSOR_NAMES}. Ordinary photographs: --angles none. Shots through "
             "a filter: --angles unknown, or angles in their names.",
@@ -206,8 +207,8 @@ def _require_photographs(root: Path) -> None:
         raise PolarguideError(
             root,
             expected="angles as in cup_45 or in folders 0, 45, 90 and 135",
-            found=f"pictures that are numbered like angles otherwise ({listed([p.name for p in numbered])})",
-            remedy="Rename them; or ordinary photographs, without a filter: --angles none.",
+            found=f"pictures with angles in another form ({listed([p.name for p in numbered])})",
+            remedy="Rename them. Ordinary photographs without a filter: --angles none.",
         )
     each = shots_of_one_place(files)
     if each is not None:
@@ -215,18 +216,19 @@ def _require_photographs(root: Path) -> None:
         raise PolarguideError(
             root,
             expected="the angles of shots through a filter",
-            found=f"{len(files)} pictures of which {each} each in a row show one place",
-            remedy=f"Give the angles in their order, such as --angles {angles} --shots-per-view {each}. Ordinary "
-            "photographs, without a filter: --angles none.",
+            found=f"{len(files)} pictures, of which groups of {each} consecutive ones show one place",
+            remedy=f"Specify the angles in their order, such as --angles {angles} --shots-per-view {each}. Ordinary "
+            "photographs without a filter: --angles none.",
         )
 
 
 def frames_of_video(
     root: Path, out: Path, settings: PrepareSettings, reporter: Reporter
 ) -> tuple[Path, PrepareSettings]:
-    """The folder of pictures to prepare: of a video, or of a folder with nothing but one, that of its frames.
+    """Return the folder of pictures to prepare: ``root``, or the folder of the frames of a video.
 
-    Frames are written beside ``out``. They are photographs as displayed (sRGB) unless the settings say otherwise.
+    A folder that contains only a video counts as the video. Frames are written next to ``out``. They are photographs in
+    sRGB unless the settings specify otherwise.
 
     Raises:
         PolarguideError: there are several videos, or one cannot be read.
@@ -238,16 +240,16 @@ def frames_of_video(
     if root.is_dir() and any(path.is_dir() or path.suffix.lower() in SHOT_SUFFIXES + RAW_SUFFIXES
                              for path in root.iterdir()):  # fmt: skip
         reporter.say(
-            f"Not used: {names}. Frames of a video are taken with polarguide prepare VIDEO --out SCENE."
+            f"Not used: {names}. To prepare frames of a video, use polarguide prepare VIDEO --out SCENE."
         )
         return root, settings
     if len(videos) > 1:
         raise PolarguideError(
-            root, expected="one video", found=names, remedy="Give the path of one: polarguide prepare VIDEO."
+            root, expected="one video", found=names, remedy="Specify one path: polarguide prepare VIDEO."
         )
     folder = out.resolve().with_name(f"{out.resolve().name}-frames")
     count = extract_frames(videos[0], folder, reporter)
-    reporter.say(f"{count} frames of {names} are in {folder}: the sharpest of equal spans of time.")
+    reporter.say(f"{count} frames of {names} are in {folder}: the sharpest frame of each time interval.")
     return folder, replace(
         settings,
         angles=settings.angles or "none",
@@ -256,10 +258,10 @@ def frames_of_video(
 
 
 def are_single_shots(root: Path, settings: PrepareSettings) -> bool:
-    """Whether a folder holds photographs through a filter that are not four to a view, by what says their angles.
+    """Return True if a folder holds photographs through a filter that are not four per view.
 
-    That is a table or an option, an angle other than the four, or one angle a view. Four angles of which some are
-    missing may be a mistake: ``--format singles`` takes what there is.
+    The evidence is a table or an option, an angle other than the four, or one angle per view. Four angles with some
+    missing may be a mistake, which only ``--format singles`` accepts.
     """
     if settings.sensor is not None:
         return False
@@ -276,7 +278,7 @@ def are_single_shots(root: Path, settings: PrepareSettings) -> bool:
 
 
 def _unknown_layout(root: Path) -> PolarguideError:
-    """The error that files say nothing of what they are: what is there, and the commands."""
+    """Return the error for files without a recognizable format. It lists the files and the possible commands."""
     mosaics = index_files(root, RAW_SUFFIXES)
     folders = sorted(path.name for path in root.iterdir() if path.is_dir() and not path.name.startswith("."))
     named = listed(sorted(path.name for path in mosaics.values()))
@@ -296,7 +298,7 @@ def _unknown_layout(root: Path) -> PolarguideError:
     inside = (folder for folder, _, names in below if any(name.lower().endswith(suffixes) for name in names))
     folder = next(inside, None)
     if folder is not None:
-        remedy = f"Give the folder that the pictures are in, such as {Path(folder)}. {remedy}"
+        remedy = f"Specify the folder of the pictures, such as {Path(folder)}. {remedy}"
     return PolarguideError(
         root,
         expected="shots through a filter, raw mosaics with --sensor, or a published dataset",
@@ -305,7 +307,7 @@ def _unknown_layout(root: Path) -> PolarguideError:
     )
 
 
-POSES_BESIDE = (
+POSE_NAMES = (
     "sparse",
     "transforms.json",
     "transforms_train.json",
@@ -314,7 +316,7 @@ POSES_BESIDE = (
     "cameras_new.npz",
     "cameras_sphere.npz",
 )
-"""Names of files and folders of poses that may lie beside pictures."""
+"""Names of files and folders of poses next to pictures."""
 
 
 def _source(
@@ -341,7 +343,7 @@ def _source(
 
 
 def origin_of_poses(pictures: Source, origin: str) -> str:
-    """The origin of the poses: "dataset", "sfm", "none" or a path."""
+    """Return the origin of the poses: "dataset", "sfm", "none" or a path."""
     if origin == "auto":
         return "sfm" if pictures.cameras is None else "dataset"
     if origin == "dataset" and pictures.cameras is None:
@@ -355,9 +357,11 @@ def origin_of_poses(pictures: Source, origin: str) -> str:
 
 
 def known_poses(root: Path, pictures: Source, origin: str, poses_of: str = "auto") -> Poses | None:
-    """The poses of a dataset, or of a file or folder; None for other origins.
+    """Read the poses of a dataset, a file or a folder; None for other origins.
 
-    ``poses_of`` says what they are of where EXIF turns pictures: cameras without a size get that of those pixels.
+    Args:
+        root: folder of the capture. pictures: source of the pictures. origin: result of ``origin_of_poses``.
+        poses_of: pixels that the poses refer to. Cameras without a size get the size of these pixels.
     """
     if origin in ("sfm", "none"):
         return None
@@ -377,7 +381,7 @@ def known_poses(root: Path, pictures: Source, origin: str, poses_of: str = "auto
             stored = pictures.stored(view if view in known else pictures.views[0])
             sizes = stored.sizes
             if poses_of == "displayed" and stored.orientation in QUARTER_TURNS:
-                sizes = (*sizes[1:2], *sizes[:1], *sizes[2:])  # turned, stored, developed
+                sizes = (*sizes[1:2], *sizes[:1], *sizes[2:])  # rotated, stored, developed
             return sizes
 
         cameras, tests = read_parts(parts, pictures.views, sizes)
@@ -390,7 +394,7 @@ def known_poses(root: Path, pictures: Source, origin: str, poses_of: str = "auto
 
 
 def _notes_of_parts(path: Path, parts: Mapping[str, Path], poses: Poses) -> tuple[str, ...]:
-    """Which parts of a capture the poses are of."""
+    """Return notes on the parts of a capture with poses."""
     if path.is_dir() and len(parts) > 1:
         held = (
             f"{len(poses.held_out)} views of {parts[TEST].name} are held out for tests."
@@ -401,24 +405,28 @@ def _notes_of_parts(path: Path, parts: Mapping[str, Path], poses: Poses) -> tupl
     beside = parts_of_poses(path.parent) if path.is_file() else {}
     if path in beside.values() and len(beside) > 1 and poses.missing:
         others = listed([file.name for file in beside.values() if file != path])
-        return (f"{others} beside {path.name}: --poses {shlex.quote(str(path.parent))} reads all of them.",)
+        return (f"{others} in the folder of {path.name}: --poses {shlex.quote(str(path.parent))} reads all.",)
     return ()
 
 
-def settle_pose_frames(pictures: Source, poses: Poses, frame_given: str) -> str:
-    """Decide which views are used as stored, because the poses are of the stored pixels, and tell the source.
+CONVENTION = "the convention of COLMAP, Metashape and nerfstudio"
+"""Reason for stored pixels if the sizes of the cameras do not decide."""
 
-    COLMAP, Metashape and nerfstudio read pixels as stored and leave the orientation tag alone; other programs turn the
-    pictures first. Where a quarter turn exchanges width and height, the size of the pose's camera tells. Views whose
-    sizes tell nothing (half a turn, a mirror image, a square) are as those that do; where none does, as stored.
+
+def settle_pose_frames(pictures: Source, poses: Poses, frame_given: str) -> str:
+    """Decide which views are used as stored because their poses refer to the stored pixels, and configure the source.
+
+    COLMAP, Metashape and nerfstudio read pixels as stored and ignore the orientation tag. Other programs rotate the
+    pictures first. If a quarter turn exchanges width and height, the size of the pose's camera decides. Other views
+    (half a turn, a mirror image, a square) follow the decided ones. The default is the stored orientation.
 
     Args:
-        pictures: the source, which has not developed a view yet.
-        poses: from outside; their cameras have sizes.
-        frame_given: what the user says; ``auto`` decides as above.
+        pictures: the source, before the first view is developed.
+        poses: poses of another program, with sizes of cameras.
+        frame_given: value of ``--poses-of``.
 
     Returns:
-        One line for the user; empty where no picture has an orientation tag.
+        A note for the user; empty if no picture has an orientation tag.
     """
     codes: dict[str, int] = {}
     by_size: dict[str, bool] = {}
@@ -434,26 +442,24 @@ def settle_pose_frames(pictures: Source, poses: Poses, frame_given: str) -> str:
                 by_size[view] = (width > height) == (camera[0] > camera[1])
     if not codes:
         return ""
-    alike = set(by_size.values())
-    others = frame_given == "stored" if frame_given != "auto" else alike != {False}
-    as_stored = {view: others if frame_given != "auto" else by_size.get(view, others) for view in codes}
-    unturned = [view for view, keep in as_stored.items() if keep]
-    pictures.use_stored(unturned)
-    reason = "as --poses-of says" if frame_given != "auto" else "as the sizes of the cameras tell"
-    if frame_given == "auto" and not alike:
-        reason = "as COLMAP, Metashape and nerfstudio read pictures; sizes do not tell"
-    counts = Counter(codes.values())
-    turns = listed([f"{count} {TURNS[code]}" for code, count in sorted(counts.items())])
-    if len(unturned) in (0, len(codes)):
-        frame, other = ("stored", "displayed") if unturned else ("displayed", "stored")
-        text = f"their poses are taken to be of the {frame} pixels, {reason}"
+    if frame_given == "auto":
+        default = set(by_size.values()) != {False}
+        reason = "according to the sizes of the cameras" if by_size else CONVENTION
     else:
-        frame = "stored"
-        other = "displayed"
-        kind = f"the poses of {len(unturned)} are taken to be of the stored pixels"
-        text = f"{kind}, {reason}, those of the others of the displayed ones"
-    used = "Those views, their angles and masks are used as stored. " if unturned else ""
+        default = frame_given == "stored"
+        by_size.clear()
+        reason = "according to --poses-of"
+    as_stored = [view for view in codes if by_size.get(view, default)]
+    pictures.use_stored(as_stored)
+    turns = listed([f"{count} {TURNS[code]}" for code, count in sorted(Counter(codes.values()).items())])
+    other = "displayed" if as_stored else "stored"
+    text = f"the poses refer to the {'stored' if as_stored else 'displayed'} pixels, {reason}"
+    if 0 < len(as_stored) < len(codes):
+        text = (
+            f"{len(as_stored)} poses refer to the stored pixels, {reason}, the others to the displayed pixels"
+        )
+    used = "These views, their angles and masks are used as stored. " if as_stored else ""
     return (
         f"EXIF orientation of {len(codes)} of {len(poses.views)} views ({turns}): {text}. {used}"
-        f"If the poses are of the {other} pixels: --poses-of {other}."
+        f"If the poses refer to the {other} pixels, use --poses-of {other}."
     )

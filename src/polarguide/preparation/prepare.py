@@ -1,7 +1,7 @@
-"""The scene folder while it is written: nothing half-written looks whole, and what is done is done once.
+"""Preparation of a scene folder from camera files, with an atomic result and resume after a stop.
 
-``prepare.json`` keeps what was asked and which views are written; ``scene.json`` takes its place as the last file.
-A folder without ``scene.json`` is not finished; the same command goes on with it.
+``prepare.json`` records the request and the written views. ``scene.json`` replaces it as the last file. A folder
+without ``scene.json`` is unfinished, and the same command resumes it.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from polarguide import __version__
 from polarguide.capture.colmap.model import read_model
-from polarguide.capture.colmap.poses import Geometry, Poses
+from polarguide.capture.colmap.poses import Geometry, Poses, Undistortion
 from polarguide.capture.colmap.sfm import LEAST_VIEWS, NotConnectedError, reconstruct, tone_mapped
 from polarguide.capture.colmap.triangulate import add_points
 from polarguide.capture.exposures import Angle
@@ -62,11 +62,12 @@ from polarguide.preparation.journal import (
     Request,
     State,
     ViewRecord,
+    WarpRecord,
     changed_entry,
     request_of,
 )
 from polarguide.preparation.open_source import (
-    POSES_BESIDE,
+    POSE_NAMES,
     frames_of_video,
     known_poses,
     open_source,
@@ -74,7 +75,7 @@ from polarguide.preparation.open_source import (
     settle_pose_frames,
 )
 from polarguide.preparation.settings import PrepareSettings, known_intrinsics
-from polarguide.preparation.source import Source, developed
+from polarguide.preparation.source import Source, develop_view
 
 JOURNAL = "prepare.json"
 SCENE = "scene.json"
@@ -83,33 +84,33 @@ SFM = ".sfm"
 PARTIAL = ".sparse.partial"
 FOLDERS = ("polar", "invalid", "masks", "sparse")
 """Folders of a scene that a preparation writes into."""
-REMEDY = "Give another --out; nothing was written."
+REMEDY = "Choose another --out. Nothing was written."
 # Angle in the name of a picture.
 _LABEL = r"(\d{3}(\.\d+)?|unknown|none)(-\d+)?"
-_OF_POSES = ("poses", "poses_of", "matching", "sfm_pictures", "intrinsics", "refine_intrinsics", "seed")
+_POSE_SETTINGS = ("poses", "poses_of", "matching", "sfm_pictures", "intrinsics", "refine_intrinsics", "seed")
 _EARLIER_SETTINGS = {"analyzers": None, "angles": None, "poses_of": "auto", "shots_per_view": None}
-"""Settings that earlier journals do not have."""
+"""Defaults of settings that earlier journals lack."""
 
 
 class SceneFolder:
-    """An ``--out`` folder, new or gone on with."""
+    """An ``--out`` folder, new or resumed."""
 
     def __init__(self, root: Path, request: Request, measured_type: type[Measured]) -> None:
-        """Open the folder; nothing is written yet.
+        """Open the folder without writing.
 
         Args:
             root: the folder.
-            request: source, files and settings of this call. ``settings.poses`` may follow on none.
+            request: source, files and settings of this call. Poses may be added to a scene without poses.
             measured_type: type of the measurements of the source.
 
         Raises:
-            PolarguideError: the folder holds something else, or a preparation of something else.
+            PolarguideError: the folder contains other files, or the result of another request.
         """
         self.root = root
         self.state = State[Any](request)
         self.finished = False
         self._finished_before: bytes | None = None
-        self._there_before = root.exists()
+        self._existed = root.exists()
         check_out(root)
         finished = root / SCENE
         unfinished = root / JOURNAL
@@ -148,15 +149,11 @@ class SceneFolder:
         if settings.get("matching") == "exhaustive" and now["matching"] == "auto":
             now["matching"] = "exhaustive"  # the default of earlier journals
         follows_none = settings.get("poses") == "none" != now["poses"]
-        ignored = _OF_POSES if follows_none else ()
-        old, new = (
-            msgspec.structs.replace(
-                each,
-                settings={name: value for name, value in given.items() if name not in ignored},
-                model={} if follows_none else each.model,
-            )
-            for each, given in ((before.request, settings), (request, now))
-        )
+        if follows_none:
+            settings |= {name: now[name] for name in _POSE_SETTINGS}
+        model = request.model if follows_none else before.request.model
+        old = msgspec.structs.replace(before.request, settings=settings, model=model)
+        new = msgspec.structs.replace(request, settings=now)
         difference = changed_entry(old, new)
         if difference is not None:
             name, was, is_now = difference
@@ -164,7 +161,7 @@ class SceneFolder:
                 self.root,
                 expected=f"a preparation with {name} {was}",
                 found=f"{name} {is_now}",
-                remedy="Repeat the command as it was, or give another --out; nothing was written.",
+                remedy="Repeat the earlier command, or choose another --out. Nothing was written.",
             )
         views = {canonical(view): record for view, record in before.views.items()}
         self.state = State(request, before.measured, views)
@@ -172,7 +169,7 @@ class SceneFolder:
 
     @property
     def views(self) -> dict[str, ViewRecord]:
-        """Records of the views that are written."""
+        """Records of the written views."""
         return self.state.views
 
     @property
@@ -183,36 +180,36 @@ class SceneFolder:
         return measured
 
     @contextlib.contextmanager
-    def held(self) -> Iterator[None]:
-        """Create the folder, and keep other calls out of it.
+    def lock(self) -> Iterator[None]:
+        """Create the folder and lock it.
 
         Raises:
-            PolarguideError: one is at work in it, or it cannot be created.
+            PolarguideError: another process holds the lock, or the folder cannot be created.
         """
         make_folder(self.root)
         with only_writer(
             self.root,
-            expected="a folder that nobody else writes",
-            found="another polarguide prepare at work on it",
+            expected="a folder that no other process writes",
+            found="another polarguide prepare that writes it",
         ):
             yield
 
     def start(self) -> None:
-        """Take note of the request."""
+        """Write the request."""
         work = self.root / SFM
         require_inside(self.root, *(self.root / name for name in (*FOLDERS, PARTIAL, SFM)), *work.rglob("*"))
         if (self.root / SCENE).exists():
             self._finished_before = read_file(self.root / SCENE)
         make_folder(self.root)
-        self.save()  # first: without it nobody could go on with the folder
+        self.save()  # first, because a later call resumes from it
         make_folder(self.root / "polar")
         make_folder(self.root / "invalid")
         (self.root / SCENE).unlink(missing_ok=True)
 
     def abandon(self) -> None:
-        """Take back what was begun: a scene without poses is as it was, and of a new folder nothing is left.
+        """Undo this call: restore a scene without poses, and remove a new folder.
 
-        Views that an earlier call has written stay for the next one.
+        Views from an earlier call remain for the next call.
         """
         shutil.rmtree(self.root / SFM, ignore_errors=True)
         if self._finished_before is not None:
@@ -222,8 +219,8 @@ class SceneFolder:
             for name in FOLDERS:
                 shutil.rmtree(self.root / name, ignore_errors=True)
             (self.root / JOURNAL).unlink(missing_ok=True)
-            if not self._there_before:
-                with contextlib.suppress(OSError):  # not empty: somebody put something there
+            if not self._existed:
+                with contextlib.suppress(OSError):  # another process added files
                     self.root.rmdir()
 
     def save(self) -> None:
@@ -231,12 +228,12 @@ class SceneFolder:
         write_whole(self.root / JOURNAL, to_json({"prepare": msgspec.to_builtins(self.state)}))
 
     def finish(self, summary: dict[str, Any]) -> None:
-        """Write ``scene.json``, the sign that the scene is whole, and drop the journal."""
+        """Write ``scene.json``, which marks the scene as complete, and remove the journal."""
         write_whole(self.root / SCENE, to_json({**summary, "prepare": msgspec.to_builtins(self.state)}))
         (self.root / JOURNAL).unlink(missing_ok=True)
 
-    def has(self, view: str, warp: object) -> bool:
-        """Return True if the folder holds all files of a view, made with the same undistortion."""
+    def has(self, view: str, warp: WarpRecord | None) -> bool:
+        """Return True if the folder contains all files of a view with the same undistortion."""
         record = self.views.get(view)
         return (
             record is not None
@@ -269,17 +266,17 @@ class SceneFolder:
         self.save()
 
     def drop(self, view: str) -> None:
-        """Remove a view that an earlier call without poses wrote, and that has none."""
+        """Remove a view of an earlier call without poses."""
         for name in self.views.pop(view).files:
             (self.root / name).unlink(missing_ok=True)
         self.save()
 
 
 def _require_own_files(journal: Path, view: str, files: Iterable[str]) -> None:
-    """Refuse a journal that counts files as a view's that are not: what is noted there may be removed.
+    """Refuse a journal that lists files of other views or folders, because listed files may be removed.
 
     Raises:
-        PolarguideError: there is one.
+        PolarguideError: the journal lists such a file.
     """
     pictures = re.compile(rf"polar/{re.escape(view)}_{_LABEL}\.png")
     own = {f"invalid/{view}.png", f"masks/{view}.png"}
@@ -294,10 +291,10 @@ def _require_own_files(journal: Path, view: str, files: Iterable[str]) -> None:
 
 
 def _require_exposures(journal: Path, view: str, record: ViewRecord) -> None:
-    """Refuse a journal that does not say what the pictures of a view are.
+    """Refuse a journal without the exposures of the pictures of a view.
 
     Raises:
-        PolarguideError: the journal lacks it.
+        PolarguideError: exposures are missing.
     """
     named = picture_names(view, [exposure.angle for exposure in record.exposures or ()])
     pictures = sorted(name for name in record.files if name.startswith("polar/"))
@@ -310,8 +307,8 @@ def _require_exposures(journal: Path, view: str, record: ViewRecord) -> None:
         )
 
 
-class Workshop:
-    """A hidden folder in the scene while it is made."""
+class PoseEstimation:
+    """Estimation of poses and points in a hidden folder of the scene."""
 
     def __init__(
         self, folder: SceneFolder, pictures: Source, settings: PrepareSettings, reporter: Reporter
@@ -323,7 +320,7 @@ class Workshop:
         self._root = folder.root / SFM
 
     def structure(self) -> Path:
-        """The model that structure from motion finds for all views.
+        """Reconstruct all views by structure from motion, and return the folder of the model.
 
         Raises:
             PolarguideError: too few views are registered.
@@ -344,10 +341,10 @@ class Workshop:
         )
 
     def points(self, poses: Poses) -> tuple[Poses, dict[str, Any]]:
-        """The same poses with points, and how these came about.
+        """Triangulate points for given poses; return the poses with points, and a record of the points.
 
         Raises:
-            PolarguideError: there is no place that the cameras look at.
+            PolarguideError: the cameras do not look at a common place.
         """
         cameras = poses.developed(self._photographs(poses.views))
         settings = self._settings
@@ -362,14 +359,14 @@ class Workshop:
         return Poses.read(model, self._pictures.views), record
 
     def _photographs(self, views: list[str]) -> dict[str, Geometry]:
-        """Tone-mapped pictures and object masks of views, and how they lie in the files."""
+        """Write tone-mapped pictures and object masks of views, and return the geometry of each view."""
         images = self._root / "images"
         masks = self._root / "masks"
         measured = self._folder.measured
         known = measured.photographs or {}
         measured.photographs = known
         if images.is_dir() and any(stem_of(path) not in views for path in images.iterdir()):
-            shutil.rmtree(self._root, ignore_errors=True)  # of an earlier call with other poses
+            shutil.rmtree(self._root, ignore_errors=True)  # from an earlier call with other poses
             known.clear()
         for path in (images, masks):
             make_folder(path)
@@ -377,7 +374,7 @@ class Workshop:
             for count, view in enumerate(views, 1):
                 path = images / f"{view}.png"
                 if view not in known or not path.exists():
-                    done = developed(self._pictures, view, measured)
+                    done = develop_view(self._pictures, view, measured)
                     if done.mask is not None:
                         write_png(masks / f"{view}.png", done.mask.astype(np.uint8) * 255)
                     write_png(path, tone_mapped(done.intensities, self._settings.sfm_pictures))
@@ -388,9 +385,9 @@ class Workshop:
 
 
 def _untried(settings: PrepareSettings, kind: str) -> str:
-    """The options that change something about structure from motion, for a message."""
+    """Return the options that influence structure from motion, for a message."""
     ways = ["--matching exhaustive (compares all pairs)"] if settings.matching != "exhaustive" else []
-    if settings.sfm_pictures != "minimum" and kind != "singles":  # of one picture, the minimum is the picture
+    if settings.sfm_pictures != "minimum" and kind != "singles":  # the minimum of one picture is the picture
         ways.append("--sfm-pictures minimum (less glare)")
     if settings.intrinsics is None:
         ways.append("--intrinsics fx,fy,cx,cy (in pixels of the developed pictures)")
@@ -399,21 +396,21 @@ def _untried(settings: PrepareSettings, kind: str) -> str:
 
 
 MOSTLY = 0.5
-"""Share of saturated pixels from which on a view is warned of."""
-# Notes on single views that are printed; sixty alike hide what matters.
+"""Share of saturated pixels above which a view gets a warning."""
+# Largest number of notes on single views that are printed.
 _NOTES = 4
 
 
 @dataclass(frozen=True)
 class Prepared:
-    """The outcome of a preparation.
+    """Result of a preparation.
 
     Attributes:
-        folder: the scene.
+        folder: folder of the scene.
         views: names of the views in it.
         left_out: views without a pose.
-        posed: whether it has a COLMAP model.
-        new: whether anything was written by this call.
+        posed: True with a COLMAP model.
+        new: True if this call wrote files.
     """
 
     folder: Path
@@ -431,18 +428,17 @@ def prepare_scene(
 ) -> Prepared:
     """Write a scene folder from camera files; see docs/reference/formats.md.
 
-    The same call resumes a stopped one. Nothing but unfinished work of the same request
-    is ever replaced.
+    The same call resumes a stopped one. Only unfinished work of the same request is replaced.
 
     Args:
         source: folder of raw mosaics, of filter shots, or of single shots; or a video.
         out: scene folder: new, empty, or of the same request.
-        settings: what to do.
-        reporter: where messages and progress go.
+        settings: settings of the preparation.
+        reporter: receives messages and progress.
 
     Raises:
-        PolarguideError: the source or a setting cannot be used, ``out`` holds something else, or structure from motion
-            does not connect the views; then nothing of this call is left in ``out``.
+        PolarguideError: the source or a setting is invalid, ``out`` contains other files, or structure from motion does
+            not connect the views. Then this call leaves no files in ``out``.
     """
     settings = settings or PrepareSettings()
     reporter = reporter or Reporter()
@@ -455,9 +451,9 @@ def prepare_scene(
     if settings.poses != "sfm" and settings.intrinsics is not None:
         raise PolarguideError(
             "--intrinsics",
-            expected="poses by structure from motion, which they are for",
+            expected="--poses sfm with --intrinsics",
             found=f"--poses {settings.poses}",
-            remedy="Leave them out: the cameras come with the poses.",
+            remedy="Omit --intrinsics: the poses contain the cameras.",
         )
     if settings.poses == "sfm" and len(pictures.views) < LEAST_VIEWS:
         raise PolarguideError(
@@ -480,7 +476,7 @@ def prepare_scene(
     )
     folder = SceneFolder(target, request, pictures.measured_type)
     if folder.finished:
-        reporter.say(f"{target} is complete already; nothing to do.")
+        reporter.say(f"{target} is already complete.")
         return _outcome(folder, pictures, settings, new=False)
     reporter.say(f"{len(pictures.views)} views, format {pictures.kind}.")
     if frames:
@@ -489,23 +485,21 @@ def prepare_scene(
         reporter.say(note)
     for warning in poses.warnings if poses is not None else ():
         reporter.warn(warning)
-    beside = [name for name in POSES_BESIDE if (root / name).exists()]
-    if beside and settings.poses == "sfm":
-        ways = " or ".join(f"--poses {shlex.quote(str(root / name))}" for name in beside)
-        reporter.say(
-            f"Poses by structure from motion. The folder holds poses, too: {ways} takes them instead."
-        )
+    unused = [name for name in POSE_NAMES if (root / name).exists()]
+    if unused and settings.poses == "sfm":
+        options = " or ".join(f"--poses {shlex.quote(str(root / name))}" for name in unused)
+        reporter.say(f"Poses by structure from motion. The folder also contains poses: use {options}.")
     if folder.state.measured is None:
         with reporter.track("measuring", len(pictures.views)) as advance:
             folder.state.measured = pictures.measure(advance)
         bare = [view for view in pictures.views if view not in pictures.masks]
         if pictures.masks and bare:
             folder.measured.notes.append(
-                f"{len(bare)} of {len(pictures.views)} views have no mask and are used whole ({listed(bare)})."
+                f"{len(bare)} of {len(pictures.views)} views have no mask and are used completely ({listed(bare)})."
             )
         for note in folder.measured.notes:
             reporter.say(note)
-    with folder.held():
+    with folder.lock():
         return _write_scene(root, folder, pictures, settings, poses, reporter)
 
 
@@ -517,10 +511,10 @@ def _write_scene(
     poses: Poses | None,
     reporter: Reporter,
 ) -> Prepared:
-    """Write what is missing of a scene that has been measured."""
+    """Write the missing parts of a measured scene."""
     tests = () if poses is None else poses.held_out
     folder.start()
-    work = Workshop(folder, pictures, settings, reporter)
+    work = PoseEstimation(folder, pictures, settings, reporter)
     points: dict[str, Any] | None = None
     if settings.poses == "sfm":
         try:
@@ -540,7 +534,7 @@ def _write_scene(
         points = {"from": "the model given", "count": poses.points}
     if poses is not None and poses.missing:
         reporter.warn(
-            f"{len(poses.missing)} of {len(pictures.views)} views have no pose and are left out "
+            f"{len(poses.missing)} of {len(pictures.views)} views have no pose and are skipped "
             f"({listed(poses.missing)})."
             + "".join(f" {folder} is another model, with {count} views." for folder, count in poses.others())
         )
@@ -562,21 +556,21 @@ def _write_scene(
 
 
 def _without_poses(root: Path, pictures: Source, settings: PrepareSettings) -> str:
-    """A message's list of what views without poses can be used for."""
+    """Return the remedy for a capture without poses: commands for views without poses."""
     out = f"--out {shlex.quote(root.resolve().name + '-priors')}"
     if pictures.kind == "singles":
         return "--poses none develops the photographs without poses."
     if pictures.kind not in ("mosaic", "filter"):
         return (
-            f"Without poses: --poses none develops the views, then polarguide priors SCENE {out} shows each."
+            f"Without poses: --poses none develops the views, and polarguide priors SCENE {out} shows them."
         )
     differing = changed(settings)
     names = [f.name for f in (*fields(MosaicOptions), *fields(SampledOptions)) if f.name != "calibration"]
     flags = [f" {option_name(name)} {getattr(settings, name)}" for name in names if name in differing]
     command = f"polarguide priors {shlex.quote(str(root))} {out}{''.join(flags)}"
     return (
-        f"Each view alone has S0, DoLP, AoLP, normals and separations: {command}. "
-        "Nothing was written; --poses none develops the views without poses."
+        f"S0, DoLP, AoLP, normals and separation of single views: {command}. "
+        "Nothing was written. --poses none develops the views without poses."
     )
 
 
@@ -591,32 +585,32 @@ def _write_views(folder: SceneFolder, pictures: Source, poses: Poses | None, rep
             known = folder.views.get(view)
             warp = None
             if known is not None and known.turned and pictures.used_as_stored(view):
-                folder.drop(view)  # an earlier call without poses turned it for display
+                folder.drop(view)  # an earlier call without poses rotated it for display
                 known = None
             if known is not None and poses is not None:
-                warp = poses.warp(view, known.geometry).record()
+                warp = _warp_record(poses.warp(view, known.geometry))
             if not folder.has(view, warp):
-                found_faults, found_notes = _write_view(folder, pictures, view, poses)
-                faults += found_faults
-                notes += found_notes
+                view_faults, view_notes = _write_view(folder, pictures, view, poses)
+                faults += view_faults
+                notes += view_notes
             advance(count)
     for text in faults[:_NOTES]:
         reporter.warn(text)
     if len(faults) > _NOTES:
         reporter.warn(
-            f"{len(faults) - _NOTES} more views are black, saturated or masked; {SCENE} has their figures."
+            f"{len(faults) - _NOTES} more views are black, saturated or masked. {SCENE} lists their figures."
         )
     for note in notes[:_NOTES]:
         reporter.say(note)
     if len(notes) > _NOTES:
-        reporter.say(f"... and {len(notes) - _NOTES} more notes on views; {SCENE} has their figures.")
+        reporter.say(f"... and {len(notes) - _NOTES} more notes on views. {SCENE} lists their figures.")
 
 
 def _write_view(
     folder: SceneFolder, pictures: Source, view: str, poses: Poses | None
 ) -> tuple[list[str], tuple[str, ...]]:
-    """Write the pictures of a view; returns what makes it useless, and the notes about it."""
-    done = developed(pictures, view, folder.measured)
+    """Write the pictures of a view; return its faults and the notes about it."""
+    done = develop_view(pictures, view, folder.measured)
     intensities = done.intensities
     invalid = done.invalid
     mask = done.mask
@@ -625,28 +619,32 @@ def _write_view(
         warp = poses.warp(view, record.geometry)
         intensities, invalid = warp.apply(intensities, invalid)
         mask = None if mask is None else warp.apply_mask(mask)
-        record.warp = warp.record()
+        record.warp = _warp_record(warp)
     folder.write_view(view, intensities, invalid, record, mask, done.angles)
     faults = [] if mask is None or mask.any() else [f"{view}: its mask shows no object."]
     if record.clipped_share > MOSTLY:
         faults.append(f"{view}: {record.clipped_share:.0%} of its pixels are saturated.")
     elif not all(picture.any() for picture in intensities):
-        faults.append(f"{view}: a picture of it is black throughout.")
+        faults.append(f"{view}: one of its pictures is completely black.")
     elif len(intensities) > 1 and all(np.array_equal(intensities[0], other) for other in intensities[1:]):
-        faults.append(
-            f"{view}: its {'four ' * (len(intensities) == 4)}pictures are the same, as copies of one are."
-        )
+        faults.append(f"{view}: its {'four ' * (len(intensities) == 4)}pictures are identical.")
     elif list(done.angles or ANGLES) == list(ANGLES):
         faults += [
-            f"{view}: its pictures at {ANGLES[a]} and {ANGLES[b]} degrees are the same, as copies of one are."
+            f"{view}: its pictures at {ANGLES[a]} and {ANGLES[b]} degrees are identical."
             for a, b in itertools.combinations(range(len(ANGLES)), 2)
             if np.array_equal(intensities[a], intensities[b])
         ]
     return faults, done.notes
 
 
+def _warp_record(warp: Undistortion) -> WarpRecord | None:
+    """Return the record of an undistortion; None without distortion."""
+    record = warp.record()
+    return None if record is None else WarpRecord(**record)
+
+
 def _turns(folder: SceneFolder) -> str:
-    """Which views were turned for display, and their polarizer angles with them; empty where none was."""
+    """Return a note on the views that were rotated for display; empty without such views."""
     records = [record for record in folder.views.values() if record.turned]
     if not records:
         return ""
@@ -655,12 +653,12 @@ def _turns(folder: SceneFolder) -> str:
     noted = [shot.angle for record in records for shot in record.exposures or ()]
     # Shots of a view at the usual four angles have no list of exposures.
     angles = not noted or any(not isinstance(angle, str) for angle in noted)
-    also = ", and the polarizer angles with them" if angles else ""
-    return f"EXIF orientation: {len(records)} of {len(folder.views)} views were turned for display{also} ({turned})."
+    also = ", including their polarizer angles" if angles else ""
+    return f"EXIF orientation: {len(records)} of {len(folder.views)} views were rotated for display{also} ({turned})."
 
 
 def _write_model(folder: SceneFolder, poses: Poses) -> None:
-    """Put the model into place in one step, after reading it back."""
+    """Replace the model in one step, after reading it back."""
     partial = folder.root / PARTIAL
     final = folder.root / "sparse"
     for old in (partial, final):
@@ -678,7 +676,7 @@ def _write_model(folder: SceneFolder, poses: Poses) -> None:
 def _summary(
     folder: SceneFolder, pictures: Source, settings: PrepareSettings, points: dict[str, Any] | None
 ) -> dict[str, Any]:
-    """The notes in ``scene.json`` for readers; everything else is under "prepare"."""
+    """Return the notes in ``scene.json`` for readers; "prepare" contains everything else."""
     measured = msgspec.to_builtins(folder.measured)
     for name in ("photographs", "light"):
         measured.pop(name, None)

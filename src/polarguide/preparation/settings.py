@@ -1,4 +1,4 @@
-"""Settings of ``prepare``. Nothing here imports torch, OpenCV or pycolmap."""
+"""Settings of ``prepare``. This module does not import torch, OpenCV or pycolmap."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from polarguide.geometry.polarizer import ANGLES
 
 Dataset = Literal["pandora", "pisr", "nersp", "neisf", "gnerp", "phygap"]
 ORIGINS = ("auto", "dataset", "sfm", "none")
-"""Values of ``poses`` besides a path."""
+"""Values of ``poses`` that are not paths."""
 
 
 @dataclass(frozen=True)
@@ -39,8 +39,8 @@ class PictureSettings(SampledOptions):
 
     Attributes:
         white_balance: none, gray (the mean color becomes gray), or gains of R, G and B such as 1.9,1,1.6.
-        precision: source rounds the intensities to less than a fifth of a step of the camera's values, full to 16 bits,
-            in larger files.
+        precision: source rounds the intensities to less than a fifth of a step of the camera's values; full keeps 16
+            bits in larger files.
     """
 
     white_balance: str = "none"
@@ -52,7 +52,7 @@ class MosaicSettings(RawMosaicOptions, PictureSettings):
     """Settings of raw mosaics.
 
     Attributes:
-        register: Bring the four angles of half size, which lie half a pixel apart, to one place.
+        register: Align the four angles in mode half, which are half a pixel apart.
     """
 
     register: bool = True
@@ -68,10 +68,10 @@ class SinglesSettings(FilterSettings):
     """Settings of photographs through a filter at any angles.
 
     Attributes:
-        angles: Polarizer angles of singles: unknown or none for all, numbers in the order of the files that repeat
-            (such as 0,60,120), or the path of a table (.csv); without it angles.csv, folders or names say them.
-        shots_per_view: Consecutive photographs, by name, that are one view; --angles has as many angles, or a word.
-            Without it, groups that show one place are found.
+        angles: Polarizer angles of singles: unknown or none for all, repeating numbers in the order of the files
+            (such as 0,60,120), or the path of a table (.csv). By default, angles.csv, folders or names state them.
+        shots_per_view: Number of consecutive photographs, by name, of one view. --angles has the same number of angles,
+            or a word. By default, groups that show one place are detected.
     """
 
     angles: str | None = None
@@ -97,29 +97,29 @@ _NAMES = {"mosaic": "raw mosaics", "filter": "rotating filters", "singles": "sin
 
 @dataclass(frozen=True)
 class PrepareSettings(RawOptions, MosaicSettings, SinglesSettings):
-    """Source of a scene folder, and how it is prepared.
+    """Source of a scene folder, and settings of its preparation.
 
     Attributes:
-        format: What the source is; auto looks for datasets, the four shots of a filter, and singles (photographs
-            through a filter at any angles, each with a pose of its own), else takes mosaics.
-        bits: Bits of a sensor value in 16-bit files; without it those of the value at which samples pile up, else 12 if
-            no value exceeds 4095, else 16.
-        saturation: Stored value from which the sensor saturates; without it full scale.
+        format: Format of the source. auto detects datasets, four shots through a filter, and singles (photographs
+            through a filter at any angles, each with its own pose), else assumes mosaics.
+        bits: Bits of a sensor value in 16-bit files. By default, those of the value at which samples pile up, else 12
+            if no value exceeds 4095, else 16.
+        saturation: Stored value from which the sensor saturates. By default, full scale.
         demosaic: half, quarter or full resolution of the sensor.
-        transfer: Encoding of filter shots (auto: by the curvature of the response, as inspect judges it) and of GNeRP.
-        gains: auto corrects the exposures that files state (EXIF) and what the light tells of the gains of the angles,
-            and estimates the exposure of every single shot; exif corrects only what files state; none leaves all.
-            Gains of a calibration go first.
+        transfer: Encoding of filter shots and of GNeRP. auto measures the curvature of the response, like inspect.
+        gains: auto corrects the exposures that files state (EXIF) and the gains of the angles by the light, and
+            estimates the exposure of every single shot. exif corrects only stated exposures, none corrects nothing.
+            Gains of a calibration take precedence.
         poses: sfm, dataset, none, or the path of a COLMAP model, transforms.json (nerfstudio), cameras.xml (Metashape)
-            or cameras.npz (IDR); auto takes those of a dataset, else sfm.
-        poses_of: Whether the poses of a path are of the pixels as stored, or of pictures as EXIF orientation displays
-            them; auto decides by the sizes of the cameras, else stored.
-        matching: Pairs that SfM compares: all, or neighbors in the order of their names; auto takes neighbors for
-            frames of videos and for more than 100 pictures with running numbers.
-        sfm_pictures: What SfM finds features in: the photograph, or the minimum over the angles, which has less glare.
-        intrinsics: fx,fy,cx,cy (and k1,k2,p1,p2) of all pictures as developed, for SfM; without it they are estimated.
-        refine_intrinsics: Let SfM change the focal lengths and distortion given.
-        masks: Folder of object masks called like the views; SfM looks at their white parts alone.
+            or cameras.npz (IDR). auto uses the poses of a dataset, else sfm.
+        poses_of: Pixels that the poses of a path refer to, stored or displayed (rotated by EXIF orientation). auto
+            decides by the sizes of the cameras, else stored.
+        matching: Pairs that SfM compares, all or neighbors by name. auto uses neighbors for frames of videos and for
+            more than 100 pictures with consecutive numbers.
+        sfm_pictures: Pictures for SfM. The photograph, or the minimum over the angles, which has less glare.
+        intrinsics: fx,fy,cx,cy (and k1,k2,p1,p2) of all developed pictures, for SfM. By default, they are estimated.
+        refine_intrinsics: Let SfM refine the specified focal lengths and distortion.
+        masks: Folder of object masks named like the views. SfM uses only their white parts.
         seed: Seed of SfM.
     """
 
@@ -134,7 +134,7 @@ class PrepareSettings(RawOptions, MosaicSettings, SinglesSettings):
     seed: Annotated[int, Meta(ge=0, lt=2**31)] = 0
 
     def checked(self) -> PrepareSettings:
-        """The settings with absolute paths.
+        """Validate the settings and return them with absolute paths.
 
         Raises:
             PolarguideError: a value is out of range.
@@ -144,25 +144,25 @@ class PrepareSettings(RawOptions, MosaicSettings, SinglesSettings):
         if self.analyzers is not None and self.calibration.gains is not None:
             raise PolarguideError(
                 "calibration (gains)",
-                expected="none beside the analyzers of polarguide calibrate, which hold the gains of every pixel",
+                expected="no gains, because the analyzers of polarguide calibrate contain the gains of every pixel",
                 found=str(self.calibration.gains),
-                remedy="Leave one of them out.",
+                remedy="Remove one of the two.",
             )
         if self.shots_per_view is not None and self.angles is None:
             raise PolarguideError(
                 "--shots-per-view",
-                expected="--angles beside it: those of the shots of a view in their order, or a word",
+                expected="--angles with the angles of the shots of a view in their order, or a word",
                 found="none",
-                remedy="Give both, such as --angles 0,45,90,135 --shots-per-view 4.",
+                remedy="Specify both, such as --angles 0,45,90,135 --shots-per-view 4.",
             )
         if self.intrinsics is not None:
             known_intrinsics(self.intrinsics)
         elif self.refine_intrinsics:
             raise PolarguideError(
                 "--refine-intrinsics",
-                expected="intrinsics to begin with",
+                expected="initial values in --intrinsics",
                 found="no --intrinsics",
-                remedy="Leave it out: unknown intrinsics are always estimated.",
+                remedy="Omit it: unknown intrinsics are always estimated.",
             )
         return replace(
             self,
@@ -177,21 +177,21 @@ class PrepareSettings(RawOptions, MosaicSettings, SinglesSettings):
         )
 
     def record(self) -> dict[str, Any]:
-        """All settings as plain JSON types."""
+        """Return all settings as plain JSON types."""
         plain: dict[str, Any] = json.loads(json.dumps(dataclasses.asdict(self), default=str))
         return plain
 
 
 @dataclass(frozen=True)
 class CalibrationOptions:
-    """A calibration as the command line states it.
+    """Calibration on the command line.
 
     Attributes:
-        calibration: File of polarguide calibrate (.safetensors), or JSON file with gains, order, sense and zero; the
-            three options below go first.
-        order: Angle of the pictures called 0, 45, 90 and 135, such as 90,45,0,135.
-        sense: How the angles count as the picture is displayed; without it ccw, or as the dataset says.
-        zero: Where their zero lies, in degrees counter-clockwise from the image's horizontal.
+        calibration: File of polarguide calibrate (.safetensors), or JSON file with gains, order, sense and zero. The
+            options --order, --sense and --zero take precedence.
+        order: Angles of the pictures named 0, 45, 90 and 135, such as 90,45,0,135.
+        sense: Direction in which angles increase in the displayed picture. By default, ccw or the sense of the dataset.
+        zero: Zero of the angles, in degrees counter-clockwise from the image's horizontal.
     """
 
     calibration: Path | None = None
@@ -200,7 +200,7 @@ class CalibrationOptions:
     zero: float | None = None
 
     def read(self) -> Calibration:
-        """The calibration of the file, with what is given beside it.
+        """Read the calibration file and apply the other options.
 
         Raises:
             PolarguideError: the file or the order is wrong.
@@ -217,7 +217,7 @@ class CalibrationOptions:
                     "--order",
                     expected="four angles such as 90,45,0,135",
                     found=repr(self.order),
-                    remedy="Name the angle of the pictures called 0, 45, 90 and 135, in this order.",
+                    remedy="List the angles of the pictures named 0, 45, 90 and 135, in this order.",
                 ) from None
             calibration = replace(calibration, order=(first, second, third, fourth))
         if self.sense is not None:
@@ -225,7 +225,7 @@ class CalibrationOptions:
         return calibration if self.zero is None else replace(calibration, zero=self.zero)
 
     def analyzers(self) -> Path | None:
-        """The file, if it is one of polarguide calibrate, which ``PrepareSettings.analyzers`` takes; else None."""
+        """Return the file if polarguide calibrate wrote it, for ``PrepareSettings.analyzers``; else None."""
         return (
             self.calibration if self.calibration is not None and is_analyzer_file(self.calibration) else None
         )
@@ -242,9 +242,9 @@ def settings_of_format(settings: PrepareSettings, kind: str) -> GainOptions:
         *others, last = owners
         raise PolarguideError(
             option_name(name),
-            expected=f"only flags that apply to the format {kind}",
-            found=f"one for {', '.join(others)} and {last}" if others else f"one for {last}",
-            remedy="Leave it out, or choose another --format.",
+            expected=f"only options of the format {kind}",
+            found=f"an option of {', '.join(others)} and {last}" if others else f"an option of {last}",
+            remedy="Omit it, or choose another --format.",
         )
     calibration = settings.calibration
     if kind == "singles" and (calibration.gains is not None or calibration.order != ANGLES):
@@ -252,20 +252,20 @@ def settings_of_format(settings: PrepareSettings, kind: str) -> GainOptions:
             "calibration (gains, order)",
             expected="only sense and zero for single shots",
             found=f"gains {calibration.gains}, order {calibration.order}",
-            remedy="Say the angle and gain of every shot in angles.csv.",
+            remedy="List the angle and gain of every shot in angles.csv.",
         )
     if kind not in ("mosaic", "filter", "pisr") and settings.calibration.gains is not None:
         raise PolarguideError(
             "calibration (gains)",
-            expected=f"none for the format {kind}, whose four intensities are made from Stokes vectors",
+            expected=f"no gains for the format {kind}, whose four intensities are computed from Stokes vectors",
             found=str(settings.calibration.gains),
-            remedy="Leave the gains out; order, sense and zero apply.",
+            remedy="Remove the gains; order, sense and zero apply.",
         )
     return owner(**{f.name: getattr(settings, f.name) for f in dataclasses.fields(owner)})
 
 
 def white_gains(text: str) -> tuple[float, float, float] | None:
-    """Gains of R, G and B from a ``--white-balance``; None for "gray", which needs the pictures.
+    """Parse the gains of R, G and B from ``--white-balance``; None for "gray", which needs the pictures.
 
     Raises:
         PolarguideError: the text has another form.
@@ -278,16 +278,16 @@ def white_gains(text: str) -> tuple[float, float, float] | None:
             "--white-balance",
             expected="none, gray, or three gains from 0.05 to 20 such as 1.9,1,1.6",
             found=repr(text),
-            remedy="Take the gains from a picture of a gray card.",
+            remedy="Measure the gains in a picture of a gray card.",
         )
     return gains[0], gains[1], gains[2]
 
 
 def known_intrinsics(text: str) -> tuple[str, tuple[float, ...]]:
-    """COLMAP's camera model and parameters from ``--intrinsics``: PINHOLE of four numbers, OPENCV of eight.
+    """Parse COLMAP's camera model and parameters from ``--intrinsics``: PINHOLE with four numbers, OPENCV with eight.
 
     Raises:
-        PolarguideError: the text is neither.
+        PolarguideError: the text has another form.
     """
     numbers = decimals(text)
     if len(numbers) not in (4, 8) or not all(map(math.isfinite, numbers)) or min(numbers[:4]) <= 0:
@@ -295,7 +295,7 @@ def known_intrinsics(text: str) -> tuple[str, tuple[float, ...]]:
             "--intrinsics",
             expected="fx,fy,cx,cy or fx,fy,cx,cy,k1,k2,p1,p2 in pixels of the developed pictures",
             found=repr(text),
-            remedy="Give four or eight numbers; the center of the first pixel is at 0.5.",
+            remedy="Specify four or eight numbers; the center of the first pixel is at 0.5.",
         )
     return ("PINHOLE" if len(numbers) == 4 else "OPENCV"), numbers
 

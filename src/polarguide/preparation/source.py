@@ -1,4 +1,4 @@
-"""The interface of picture sources; that of Stokes vectors, and the sense of their angles by the outlines of masks."""
+"""Interface of picture sources, and the sources of Stokes vectors and raw mosaics."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from polarguide.capture.angle_evidence import OutlineAgreement, outline_agreement, sense_of_outlines
 from polarguide.capture.calibration import UNIDENTIFIED, Sense, oriented
 from polarguide.capture.colmap.model import PosedCamera
 from polarguide.capture.colmap.poses import Geometry
@@ -73,12 +74,12 @@ class DevelopedView:
 
 @dataclass(frozen=True)
 class Stored:
-    """How the pictures of a view lie in their files.
+    """Size and orientation of a view's pictures as stored.
 
     Attributes:
-        size: width and height of the stored pixels; None where no header states them.
-        orientation: EXIF's, 1 to 8; 1 is as stored.
-        developed: width and height of the developed picture, if it is smaller; None if not.
+        size: width and height of the stored pixels; None if no header states them.
+        orientation: EXIF orientation, 1 to 8; 1 is as stored.
+        developed: width and height of the developed picture if it is smaller, else None.
     """
 
     size: tuple[int, int] | None
@@ -87,7 +88,7 @@ class Stored:
 
     @property
     def sizes(self) -> tuple[tuple[int, int], ...]:
-        """The sizes that a camera of the view may have been made for: stored, turned, developed."""
+        """Possible sizes of the camera of a view: stored, rotated and developed."""
         if self.size is None:
             return ()
         turned = (self.size[::-1],) if self.orientation in QUARTER_TURNS else ()
@@ -95,15 +96,15 @@ class Stored:
 
 
 class Source(Protocol):
-    """The pictures of one capture.
+    """Pictures of one capture.
 
     Attributes:
         kind: name of the format.
-        cameras: by view name, if the source has poses, else None.
+        cameras: cameras by view name, or None for a source without poses.
         views: view names, sorted.
-        paths: all files that are read, but for masks.
-        masks: object masks of the user by view; the object is where one has at least half of its maximum.
-        measured_type: type of what ``measure`` returns.
+        paths: all files that are read except masks.
+        masks: object masks of the user by view; values of at least half of the maximum are object.
+        measured_type: type of the result of ``measure``.
     """
 
     measured_type: type[Measured]
@@ -114,75 +115,70 @@ class Source(Protocol):
     masks: Mapping[str, Path] = MappingProxyType({})
 
     def measure(self, advance: Advance) -> Measured:
-        """Measure what is common to the whole capture."""
+        """Measure the common properties of the capture."""
 
     def develop(self, view: str, measured: Any) -> DevelopedView:
         """Read one view."""
 
     def stored(self, view: str) -> Stored:
-        """Stored size and orientation of a view's pictures, by the header of its first file."""
+        """Return stored size and orientation of a view's pictures, from the header of its first file."""
 
     def lenses(self) -> dict[str, Lens]:
-        """The lens of each view where the files state several; else an empty dictionary."""
+        """Return the lens of each view if the files state several, else an empty dictionary."""
         return {}
 
     def use_stored(self, views: Collection[str]) -> None:
-        """Develop these views as they are stored, whatever their orientation; before any of them is developed.
+        """Develop these views as stored, without their orientation. The call must precede ``develop``.
 
-        Files of sources that do not say more have no orientation.
+        By default, files have no orientation.
         """
         return None
 
     def used_as_stored(self, view: str) -> bool:
-        """Whether ``use_stored`` named a view."""
+        """Return True if ``use_stored`` contains a view."""
         return False
 
 
-def developed(pictures: Source, view: str, measured: Measured) -> DevelopedView:
-    """The result of ``Source.develop``, with the view's mask.
+def develop_view(pictures: Source, view: str, measured: Measured) -> DevelopedView:
+    """Return the result of ``Source.develop``, with the view's mask.
 
     Raises:
-        PolarguideError: the mask cannot be read, or is neither of the stored nor the developed size.
+        PolarguideError: the mask cannot be read, or has another size than the stored and the developed picture.
     """
     done = pictures.develop(view, measured)
     if view not in pictures.masks:
         return done
     code = pictures.stored(view).orientation
     code = INVERSE[code] if pictures.used_as_stored(view) else code
-    return replace(done, mask=_fitted(pictures.masks[view], done, code))
+    return replace(done, mask=_fit_mask(pictures.masks[view], done, code))
 
 
-def _fitted(path: Path, view: DevelopedView, code: int) -> NDArray[np.bool_]:
-    """A mask at the size of the developed picture: True where at least half of a pixel is object.
+def _fit_mask(path: Path, view: DevelopedView, code: int) -> NDArray[np.bool_]:
+    """Return a mask at the size of the developed picture: True if at least half of a pixel is object.
 
-    Masks are of the picture as it is used; if width and height are exchanged, of the other way that its orientation tag
-    allows.
+    A mask with exchanged width and height is oriented like the picture.
 
     Args:
-        path: its file. view: the developed picture.
-        code: orientation that makes the used picture of the other one.
+        path: file of the mask. view: the developed picture.
+        code: EXIF orientation from the other orientation of the picture to the used one.
     """
     mask = read_mask(path)
     geometry = view.record.geometry
-    turned = mask.shape
-    size = mask.shape[::-1]
-    fitting = (geometry.size, geometry.stored)
-    if code in QUARTER_TURNS and size not in fitting and turned in fitting:
+    width, height = geometry.size
+    sizes = (geometry.size, geometry.stored)
+    if code in QUARTER_TURNS and mask.shape[::-1] not in sizes and mask.shape in sizes:
         mask = apply_orientation(mask, code)
-        size = turned
-    if size == geometry.size:
+    if mask.shape == (height, width):
         return mask
-    if size != geometry.stored:
-        width, height = geometry.size
+    if mask.shape[::-1] != geometry.stored:
         stored = geometry.stored
         raise PolarguideError(
             path,
             expected=f"the size of the picture, {width}x{height}, or of the file, {stored[0]}x{stored[1]}",
-            found=f"{size[0]}x{size[1]}",
+            found=f"{mask.shape[1]}x{mask.shape[0]}",
             remedy="Make the mask at one of these sizes.",
         )
     left, top = geometry.crop
-    width, height = geometry.size
     step = geometry.step
     cut = mask[top : top + height * step, left : left + width * step].astype(np.float32)
     return np.asarray(cv2.resize(cut, geometry.size, interpolation=cv2.INTER_AREA) >= 0.5)
@@ -191,11 +187,11 @@ def _fitted(path: Path, view: DevelopedView, code: int) -> NDArray[np.bool_]:
 PAIR_SUMS = (
     "n/a: the four intensities were made from Stokes vectors, so that I0 + I90 = I45 + I135 by construction"
 )
-_WORDS: dict[Sense, str] = {"ccw": "counter-clockwise", "cw": "clockwise"}
+_SENSE_NAMES: dict[Sense, str] = {"ccw": "counter-clockwise", "cw": "clockwise"}
 _BRIGHT = 99.9
 _HEADROOM = 2.0
 _SAMPLES = 20_000
-# Bytes that a pixel takes at least: Stokes vectors as read and where they are finite, intensities, clipped ones.
+# Smallest memory in bytes per pixel: Stokes vectors with and without invalid values, intensities, and clipped ones.
 _WORKED = 4 * 3 * (3 + 3 + 4 + 4)
 
 
@@ -204,7 +200,7 @@ class StokesMeasured(Measured, kw_only=True):
 
     Attributes:
         scale: factor of the dataset's intensities. full_scale: the dataset's intensity that becomes 1.
-        negative_share, not_finite_share: shares of intensities and of pixels.
+        negative_share: share of negative intensities. not_finite_share: share of pixels that are not finite.
         pair_sums: result of the four-angle sum check. sense: sense of the angles.
     """
 
@@ -217,12 +213,12 @@ class StokesMeasured(Measured, kw_only=True):
 
 
 class StokesSource(Source):
-    """Stokes vectors in any unit, without a full scale."""
+    """Source of Stokes vectors in any unit, without a full scale."""
 
     measured_type = StokesMeasured
 
     def __init__(self, dataset: Dataset, settings: CameraOptions) -> None:
-        """Use a dataset with ``read_stokes``; its sense of angles applies unless the settings name one."""
+        """Use a dataset with ``read_stokes``; its sense of angles is the default."""
         self.kind = dataset.name
         self.cameras = dataset.cameras
         self.views = dataset.views
@@ -233,23 +229,23 @@ class StokesSource(Source):
         self._calibration = replace(calibration, sense=calibration.sense or dataset.sense)
 
     def stored(self, view: str) -> Stored:
-        """By the header of a file that has the size of the Stokes vectors."""
+        """Return the size from the header of a file with the size of the Stokes vectors."""
         return Stored(stated_size(self._dataset.files[view]))
 
     def measure(self, advance: Advance) -> StokesMeasured:
         """Determine one scale for the whole capture, and the share of clipped pixels; every file is read once.
 
-        The largest intensity becomes 1 where it is at most twice the one that 0.1 % of the pixels exceed;
-        else twice this one does, and what exceeds it clips.
+        The largest intensity becomes 1 if it is at most twice the 99.9th percentile. Otherwise, twice this percentile
+        becomes 1, and larger intensities clip.
         """
         require_memory_of_each(
             self.paths,
             _WORKED,
             "Stokes vectors",
-            remedy="Make the files smaller, all by the same factor, or prepare the dataset on a larger machine.",
+            remedy="Reduce all files by the same factor, or prepare the dataset on a larger machine.",
         )
         peaks: list[NDArray[np.float32]] = []
-        rims: list[RimAgreement | None] = []
+        outlines: list[OutlineAgreement] = []
         largest = 0.0
         negative = 0
         broken = 0
@@ -262,7 +258,8 @@ class StokesSource(Source):
                 mask = resized_mask(self._dataset, view, peak.shape)
                 assert mask is not None
                 light = np.where(finite[..., None], stokes, np.nan)
-                rims.append(rim_agreement(light, mask, np.radians(self._calibration.zero)))
+                agreement = outline_agreement(light, mask, np.radians(self._calibration.zero))
+                outlines += [] if agreement is None else [agreement]
             peaks.append(peak.ravel()[:: max(1, peak.size // _SAMPLES)])
             largest = max(largest, float(peak.max()))
             negative += int((intensities < 0).sum())
@@ -276,12 +273,14 @@ class StokesSource(Source):
             )
         white = min(largest, _HEADROOM * bright) if bright > 0 else largest
         share = negative / max(1, 12 * count)
-        sense, note = self._settle_sense([rim for rim in rims if rim is not None])
-        notes = [*self._dataset.notes, f"Four-angle sum check: {PAIR_SUMS}.", note]
-        notes.append(
+        sense, note = self._settle_sense(outlines)
+        notes = [
+            *self._dataset.notes,
+            f"Four-angle sum check: {PAIR_SUMS}.",
+            note,
             f"One scale for all views: {white:.6g} of the dataset becomes full scale. {share:.3%} of the intensities "
-            "are negative (more polarized than light can be: noise, or coarse files) and become 0."
-        )
+            "are negative because of noise or coarse files, and become 0.",
+        ]
         if broken:
             notes.append(f"{broken / count:.3%} of the pixels are not finite and become invalid.")
         return StokesMeasured(
@@ -297,7 +296,7 @@ class StokesSource(Source):
         """Read one view, scale it, form the four intensities and correct the sense of the angles."""
         stokes, finite, clipped = self._stokes(view)
         intensities = np.stack(four_intensities(stokes * np.float32(measured.scale)))
-        # Rounding of the scale may leave the largest intensity a hair above 1.
+        # Rounding of the scale can move the largest intensity slightly above 1.
         clipped = clipped | (intensities > 1.0 + 1e-5).any(axis=(0, 3))
         height, width = clipped.shape
         calibration = replace(self._calibration, sense=measured.sense)
@@ -313,142 +312,53 @@ class StokesSource(Source):
             mask=resized_mask(self._dataset, view, (height, width)),
         )
 
-    def _settle_sense(self, rims: list[RimAgreement]) -> tuple[Sense, str]:
-        """The sense of the angles and the line that says why; a warning where it may be the other one."""
-        assumed = self._calibration.sense or "ccw"
-        light_sense = sense_of_rims(rims)
-        sense: Sense = assumed
-        known = self._dataset.sense_known
-        reason = (
-            "as --sense says" if self._given_sense else "as the release has them" if known else "as assumed"
-        )
-        other = "ccw" if assumed == "cw" else "cw"
+    def _settle_sense(self, outlines: list[OutlineAgreement]) -> tuple[Sense, str]:
+        """Return the sense of the angles and a note with the reason; warn if the sense is doubtful."""
+        sense = self._calibration.sense or "ccw"
+        light_sense = sense_of_outlines(outlines)
+        stated = self._given_sense is not None or self._dataset.sense_known
+        reason = "according to the release" if self._dataset.sense_known else "by assumption"
+        if self._given_sense is not None:
+            reason = "according to --sense"
+        doubt = ""
         if light_sense is not None:
-            ccw, cw = (float(np.mean([getattr(rim, way) for rim in rims])) for way in ("ccw", "cw"))
-            figures = (
-                f"agreement with the outlines of the masks: {ccw:.2f} counter-clockwise, {cw:.2f} clockwise"
-            )
-            if light_sense == assumed:
+            ccw, cw = np.mean(outlines, axis=0)
+            figures = f"agreement with the outlines of masks: {ccw:.2f} counter-clockwise, {cw:.2f} clockwise"
+            if light_sense == sense:
                 reason += f", and the light agrees ({figures})"
-            elif self._given_sense is None and not known:
-                sense = light_sense
-                reason = f"as the light at the outlines of the masks has them ({figures})"
+            elif stated:
+                doubt = f"Angles count {_SENSE_NAMES[sense]} {reason}, but the light contradicts this ({figures})."
             else:
-                warnings.warn(
-                    f"Angles are taken as {_WORDS[assumed]}, {reason}, but the light says "
-                    f"{_WORDS[light_sense]} ({figures}): "
-                    f"check with polarguide inspect; --sense {other} takes them so.",
-                    PolarguideWarning,
-                    stacklevel=3,
-                )
-        elif self._given_sense is None and not known:
-            warnings.warn(
-                f"The sense of {self.kind}'s angles is not certain, and outlines of masks do not tell: taken as "
-                f"{_WORDS[assumed]}. Check with polarguide inspect; --sense {other} takes them the other way.",
-                PolarguideWarning,
-                stacklevel=3,
+                sense = light_sense
+                reason = f"according to the light at the outlines of masks ({figures})"
+        elif not stated:
+            doubt = (
+                f"The sense of {self.kind}'s angles is uncertain, and outlines of masks do not decide it. "
+                f"Assumed: {_SENSE_NAMES[sense]}."
             )
-        return (
-            sense,
-            f"Angles count {_WORDS[sense]} as displayed, {reason} (--sense and --zero say otherwise).",
+        if doubt:
+            remedy = f"Check with polarguide inspect; --sense {'ccw' if sense == 'cw' else 'cw'} reverses it."
+            warnings.warn(f"{doubt} {remedy}", PolarguideWarning, stacklevel=3)
+        note = (
+            f"Angles count {_SENSE_NAMES[sense]} as displayed, {reason} (--sense and --zero override this)."
         )
+        return sense, note
 
     def _stokes(self, view: str) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.bool_]]:
-        """Stokes vectors [3, H, W, 3], 0 where they are not finite; where they are, and where they clipped, [H, W]."""
+        """Return Stokes vectors [3, H, W, 3] with 0 for invalid values, and masks of finite and of clipped pixels."""
         assert self._dataset.read_stokes is not None
         stokes, clipped = self._dataset.read_stokes(view)
         finite = np.asarray(np.isfinite(stokes).all(axis=(0, 3)))
         return np.where(finite[..., None], stokes, 0), finite, clipped
 
 
-# Pixels by which a mask is blurred to take the direction of its outline from its gradient.
-_BLUR = 2.0
-# Width of the band inside of the outline, as a share of the side of a square with the mask's area.
-_BAND = 0.06
-# Fewer pixels of a band tell nothing of a view.
-_LEAST = 50
-# Agreements differ by up to 1, where every pixel agrees in one sense and the outline has all directions. Noise, and
-# outlines that the body does not curve away at, agree with neither.
-_CLEAR = 0.2
-# Share of the views that have to tell the same.
-_MOST = 0.75
-
-
-@dataclass(frozen=True)
-class RimAgreement:
-    """How well the angles at the outline of one view's mask agree with the outline, if they count either way.
-
-    Attributes:
-        ccw, cw: means of cos 4(angle - direction), weighted by the degree of polarization: 1 where the light is
-            polarized across or along the outline everywhere, 0 without a relation.
-    """
-
-    ccw: float
-    cw: float
-
-
-def rim_agreement(
-    stokes: NDArray[np.float32], mask: NDArray[np.bool_], zero: float = 0.0
-) -> RimAgreement | None:
-    """Compare polarization and outline of a view; None where the mask has too little of an outline.
-
-    At the outline of a body that curves away, the surface normal lies in the picture, across the outline. Light from
-    inside the body is polarized along this normal, and light that is mirrored across it. Both agree with the outline if
-    the angles are counted as the outline is; mirrored ones agree with it only where it runs along the axes or the
-    diagonals.
-
-    Args:
-        stokes: [3, H, W, C], in the dataset's own sense.
-        mask: mask of the object, [H, W].
-        zero: where the angles begin, in radians counter-clockwise from the picture's horizontal.
-    """
-    area = int(mask.sum())
-    if area < _LEAST or mask.all():
-        return None
-    soft = cv2.GaussianBlur(mask.astype(np.float32), (0, 0), _BLUR)
-    across = cv2.Sobel(soft, cv2.CV_32F, 1, 0), cv2.Sobel(soft, cv2.CV_32F, 0, 1)
-    depth = cv2.distanceTransform(np.pad(mask, 1).astype(np.uint8), cv2.DIST_L2, 5)[1:-1, 1:-1]
-    width = max(2.0 * _BLUR, _BAND * math.sqrt(area))
-    # Beside the border of the picture, the outline is that of the picture.
-    edge = math.ceil(2 * _BLUR)
-    inner = np.zeros_like(mask)
-    inner[edge:-edge, edge:-edge] = True
-    size = np.hypot(*across)
-    band = mask & inner & (depth <= width) & (size > 1e-3) & np.isfinite(stokes).all(axis=(0, 3))
-    if int(band.sum()) < _LEAST:
-        return None
-    outline: Any = np.arctan2(-across[1], across[0])[band]  # y down in the picture, angles up
-    s0, s1, s2 = stokes.mean(axis=3)[:, band].astype(np.float64)
-    weight = np.minimum(np.hypot(s1, s2) / np.maximum(s0, 1e-12), 1.0) * (s0 > 0)
-    total = float(weight.sum())
-    if not total > 0:
-        return None
-    angle = np.arctan2(s2, s1) / 2
-    ccw, cw = (
-        float((weight * np.cos(4 * (sign * angle + zero - outline))).sum()) / total for sign in (1, -1)
-    )
-    return RimAgreement(ccw, cw)
-
-
-def sense_of_rims(agreements: Sequence[RimAgreement]) -> Sense | None:
-    """The sense that the outlines of most views agree with clearly; None where they do not tell."""
-    if not agreements:
-        return None
-    gains = np.array([view.ccw - view.cw for view in agreements])
-    mean = float(gains.mean())
-    agreeing = float((np.sign(gains) == np.sign(mean)).mean())
-    if abs(mean) < _CLEAR or agreeing < _MOST:
-        return None
-    return "ccw" if mean > 0 else "cw"
-
-
 _JUDGED = 8
-"""Mosaics of a capture that are looked through for defects of the sensor."""
+"""Largest number of mosaics that are searched for defects of the sensor."""
 _GAINS = {
     "dark": "The pictures are too dark to estimate the gains of the angles.",
-    "off": "I0 + I90 is {:+.2%} off I45 + I135, too much for gains: not corrected. Check --sensor, --offset-x, "
-    "--offset-y and --order.",
-    "corrected": f"I0 + I90 is {{:+.2%}} off I45 + I135; corrected. {UNIDENTIFIED}",
+    "off": "I0 + I90 differs from I45 + I135 by {:+.2%}, too much for gains. It is not corrected. Check --sensor, "
+    "--offset-x, --offset-y and --order.",
+    "corrected": f"I0 + I90 differed from I45 + I135 by {{:+.2%}} and is corrected. {UNIDENTIFIED}",
 }
 
 
@@ -475,7 +385,7 @@ class MosaicMeasured(Measured, kw_only=True):
 
 
 class MosaicSource(Source):
-    """Raw mosaics of a division-of-focal-plane sensor."""
+    """Source of raw mosaics of a division-of-focal-plane sensor."""
 
     measured_type = MosaicMeasured
 
@@ -485,10 +395,10 @@ class MosaicSource(Source):
         Args:
             root: the folder of mosaics.
             settings: settings of the preparation.
-            dataset: the published dataset of the mosaics, if they belong to one.
+            dataset: the published dataset of the mosaics, or None.
 
         Raises:
-            PolarguideError: the sensor is not named, or a setting does not fit it.
+            PolarguideError: the sensor is missing, or a setting does not fit it.
         """
         self.kind = "mosaic" if dataset is None else dataset.name
         self.cameras = None if dataset is None else dataset.cameras
@@ -518,7 +428,7 @@ class MosaicSource(Source):
             )
 
     def stored(self, view: str) -> Stored:
-        """By the header of the mosaic, or as the settings say."""
+        """Return the size from the header of the mosaic, or from the settings."""
         width = self._settings.width
         height = self._settings.height
         stated = None if width is None or height is None else (width, height)
@@ -532,7 +442,7 @@ class MosaicSource(Source):
         return Stored(size, developed=(across, down))
 
     def measure(self, advance: Advance) -> MosaicMeasured:
-        """Levels, gains of the angles and white balance of the capture; every file is read once."""
+        """Measure levels, gains of the angles and white balance of the capture; every file is read once."""
         counts = np.zeros(FULL_16 + 1, np.int64)
         container = 0
         shape = None
@@ -577,9 +487,9 @@ class MosaicSource(Source):
         )
         notes += [] if self._dataset is None else self._dataset.notes
         notes += counted
-        standing_out = int(self._defects(levels).sum())
-        if standing_out:
-            notes.append(defects_note(standing_out, shape[0][0] * shape[0][1]))
+        defective = int(self._defects(levels).sum())
+        if defective:
+            notes.append(defects_note(defective, shape[0][0] * shape[0][1]))
         mean = np.maximum(colors.mean(axis=1) if colors.size else np.ones(3), 1e-6)
         white = self._white or (float(mean[1] / mean[0]), 1.0, float(mean[1] / mean[2]))
         peak = max(white) / min(gains) * settings.calibration.peak
@@ -587,7 +497,7 @@ class MosaicSource(Source):
             peak *= analyzers.peak(self._mosaics.corner, cut.shape[::-1])
         rounding = EXACT
         if settings.precision == "source" and levels.gamma == 1.0:
-            # By the smallest factor that a sample is multiplied by.
+            # The smallest factor of a sample.
             factor = min(white) / max(gains) / max(1.0, peak)
             rounding = rounding_of(np.array([0.0, FULL_CODE * factor / ((1 << levels.bits) - 1)]))
         return MosaicMeasured(
@@ -600,23 +510,23 @@ class MosaicSource(Source):
             white_balance=white,
             scale=1.0 / max(1.0, peak),
             rounding=tuple(rounding),
-            defects=standing_out,
+            defects=defective,
             notes=notes,
         )
 
     def _defects(self, levels: Levels) -> NDArray[np.bool_]:
-        """The samples of a mosaic, cut to whole cells, that are no measure of light; saturated ones are told later."""
+        """Return a mask of defective samples of a mosaic cropped to whole cells, without saturated ones."""
         if self._defective is None:
             files = list(self._files.values())
-            judged = files[:: max(1, math.ceil(len(files) / _JUDGED))]
+            sample = files[:: max(1, math.ceil(len(files) / _JUDGED))]
             mosaics = (
-                np.minimum(self._mosaics.cut(self._mosaics.read(path)), levels.white) for path in judged
+                np.minimum(self._mosaics.cut(self._mosaics.read(path)), levels.white) for path in sample
             )
             self._defective = defects(mosaics, self._pattern.period)
         return self._defective
 
     def develop(self, view: str, measured: MosaicMeasured) -> DevelopedView:
-        """Read one mosaic: validity, levels, gains, then demosaicing, then the sense of the angles."""
+        """Develop one mosaic: validity, levels, gains, demosaicing, and the sense of the angles."""
         stored = self._mosaics.read(self._files[view])
         dark = self._mosaics.dark(stored.shape)
         values = self._mosaics.cut(stored)

@@ -1,7 +1,4 @@
-"""Splatting of Gaussians with any channels: one interface, a reference implementation, and fast backends.
-
-``choose_backend`` says where a training or a rendering computes.
-"""
+"""Splatting of Gaussians with any channels: one interface, a reference implementation, and fast backends."""
 
 from __future__ import annotations
 
@@ -33,20 +30,20 @@ __all__ = [
 def choose_backend(
     name: DeviceName, *, local_rank: int = 0, say: Callable[[str], None] = lambda _: None
 ) -> Backend:
-    """The backend for ``--device``: ``auto`` takes the GPU where there is one and gsplat is installed.
+    """Choose the backend of a device; ``auto`` is the GPU if the machine has one and gsplat is installed.
 
     Args:
-        name: as given.
-        local_rank: which of the machine's GPUs, for the processes of one training.
-        say: takes lines for the user, such as that kernels are being compiled.
+        name: value of ``--device``.
+        local_rank: number of the GPU in the machine, for the processes of one training.
+        say: receives messages for the user, such as the start of a compilation.
 
     Raises:
-        PolarguideError: CUDA was specified and there is no GPU, or gsplat or its kernels are not available.
+        PolarguideError: CUDA is requested, and no GPU, gsplat or kernel is available.
     """
     if name == "cpu" or (name == "auto" and not torch.cuda.is_available()):
         return Backend(torch.device("cpu"), rasterize_cpu)
     if name == "auto" and not has_gsplat():
-        say("there is a GPU, but the package gsplat is not installed: computing on the CPU")
+        say("the machine has a GPU, but the package gsplat is not installed: computing on the CPU")
         return Backend(torch.device("cpu"), rasterize_cpu)
     count = torch.cuda.device_count() if torch.cuda.is_available() else 0
     if local_rank >= count:
@@ -55,7 +52,7 @@ def choose_backend(
             "--device cuda",
             expected="a GPU for each process",
             found=f"{count} that PyTorch {torch.__version__} can use (its CUDA: {built})",
-            remedy="Install a PyTorch with CUDA and a driver for it, start fewer processes, or use --device cpu.",
+            remedy="Install PyTorch with CUDA and a matching driver, start fewer processes, or use --device cpu.",
         )
     device = torch.device("cuda", local_rank)
     torch.cuda.set_device(device)
@@ -64,7 +61,7 @@ def choose_backend(
 
 
 def use_threads(threads: int) -> None:
-    """Use this many threads everywhere in this process; 0 leaves things as they are."""
+    """Set the number of threads of the native kernels and of PyTorch in this process; 0 changes nothing."""
     if threads:
         _native.set_thread_count(threads)
         torch.set_num_threads(threads)

@@ -1,4 +1,4 @@
-"""The CPU backend: the native kernels (``native/``) as a differentiable torch function, float32."""
+"""CPU backend: the native kernels (``native/``) as a differentiable PyTorch function, float32."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from polarguide.raster.interface import (
 
 
 def native_rasterizer(camera: Camera, channels: int, statistic: ScreenStatistic | None) -> Any:
-    """A native rasterizer for one picture with ``channels`` channels, those of the statistic first."""
+    """Create a native rasterizer for one picture with ``channels`` channels, which orders the statistic's first."""
     chosen = list(statistic.channels) if statistic else []
     permutation = chosen + [k for k in range(channels) if k not in chosen]
     return _native.Rasterizer(
@@ -39,7 +39,7 @@ def native_rasterizer(camera: Camera, channels: int, statistic: ScreenStatistic 
 
 
 def finite(*splats: Tensor) -> list[Tensor]:
-    """The tensors of ``Splats`` as the kernels take them: on the CPU, contiguous, and finite.
+    """Return the tensors of ``Splats`` as input of the kernels: on the CPU, contiguous and finite.
 
     Raises:
         PolarguideError: a value is not finite.
@@ -53,10 +53,10 @@ def finite(*splats: Tensor) -> list[Tensor]:
 
 
 def _chosen(picture: Tensor, channels: tuple[int, ...]) -> Tensor:
-    """Some channels of a picture, as a tensor of their own."""
+    """Copy some channels of a picture."""
     first = channels[0]
     last = channels[-1]
-    if channels == tuple(range(first, last + 1)):  # several times as fast as any others
+    if channels == tuple(range(first, last + 1)):  # a slice is several times as fast as an index
         return picture[..., first : last + 1].contiguous()
     return picture[..., list(channels)]
 
@@ -107,7 +107,7 @@ def rasterize_cpu(
     statistic: ScreenStatistic | None = None,
     still: tuple[int, ...] = (),
 ) -> Rasterized:
-    """See ``polarguide.raster.interface``. CPU tensors, float32; deterministic for any number of threads."""
+    """Splat Gaussians on the CPU in float32; see ``Rasterize``. The number of threads does not change a bit."""
     check_shapes(splats, statistic, still)
     for name, tensor in splats._asdict().items():
         if tensor.dtype != torch.float32 or tensor.device.type != "cpu":

@@ -1,13 +1,12 @@
-"""The CUDA backend: gsplat's projection, tiling and blending behind the interface. The only file that knows gsplat.
+"""CUDA backend: gsplat's projection, tiling and blending behind the interface. No other module uses gsplat.
 
-gsplat is found, and its kernels are compiled, by ``load_gsplat``; nothing of it is imported before. Only the
-interface that 1.5.3 and 1.6.0 share is used, by keyword; what differs between them is in ``load_gsplat`` and
-``COMPILED``.
+``load_gsplat`` imports gsplat and compiles its kernels. The backend uses the part of the interface that versions 1.5.3
+and 1.6.0 share; ``load_gsplat`` and ``COMPILED`` handle their differences.
 
-Where its definition departs from ours (docs/explanation/gpu.md has the table): alpha is at most 0.999 in 1.5.3, and
-0.99 as here in 1.6.0; a pixel ends at a transmittance of 1e-4 exactly, too; the radius is that of the wider side of the
-box that is drawn, whole pixels, and at most 3.33 standard deviations; exponentials are approximate. Inputs are not
-searched for NaN, since the process would wait for the answer.
+The definition of gsplat differs from ``raster.interface`` as follows (see the table in docs/explanation/gpu.md).
+Alpha is at most 0.999 in 1.5.3 and 0.99 in 1.6.0. A pixel also ends at a transmittance of exactly 1e-4. The radius is
+the wider half side of the drawn box in whole pixels, at most 3.33 standard deviations. Exponentials are approximate.
+Inputs are not searched for NaN, because the process would wait for the device.
 """
 
 from __future__ import annotations
@@ -30,35 +29,42 @@ from polarguide.geometry.camera import Camera
 from polarguide.raster.interface import BLUR, NEAR_PLANE, Rasterized, ScreenStatistic, Splats, check_shapes
 
 TILE = 16
-# A load that takes longer than this is compiling.
+"""Side of a tile in pixels."""
 NOTICE_SECONDS = 5.0
-# Channel counts up to 33 that both versions compile; 1.5.3 pads others itself, 1.6.0 refuses them.
+"""Seconds of loading after which the kernels are certainly compiled."""
 COMPILED = (1, 2, 3, 4, 5, 8, 9, 16, 17, 32, 33)
+"""Numbers of channels up to 33 that both versions compile; 1.5.3 pads others, 1.6.0 refuses them."""
 
 
 class _View(NamedTuple):
-    """A camera as gsplat takes it, on its device: [1, 4, 4] world-to-camera, [1, 3, 3] intrinsics."""
+    """Camera as input of gsplat: [1, 4, 4] world-to-camera, [1, 3, 3] intrinsics."""
 
     viewmats: Tensor
     intrinsics: Tensor
 
 
 class _Projected(NamedTuple):
-    """Projected Gaussians, sorted into tiles. The first axis is that of pictures, of which there is one."""
+    """Projected Gaussians of one picture, sorted into tiles.
 
-    means2d: Tensor  # [1, N, 2] pixels
-    conics: Tensor  # [1, N, 3]
-    opacities: Tensor  # [1, N]
-    offsets: Tensor  # [1, rows, columns] of tiles
-    order: Tensor  # [intersections]
-    radii: Tensor  # [1, N, 2] pixels, 0 where culled
+    Attributes:
+        means2d: [1, N, 2] pixels. conics: [1, N, 3]. opacities: [1, N].
+        offsets: [1, rows, columns] first intersection of each tile. order: [intersections] Gaussians.
+        radii: [1, N, 2] pixels; 0 if culled.
+    """
+
+    means2d: Tensor
+    conics: Tensor
+    opacities: Tensor
+    offsets: Tensor
+    order: Tensor
+    radii: Tensor
 
 
 _views: WeakKeyDictionary[Camera, dict[torch.device, _View]] = WeakKeyDictionary()
 
 
 def _view(camera: Camera, device: torch.device) -> _View:
-    """The camera on a device, kept for each camera, so that a second rendering copies nothing there."""
+    """Return the camera on a device. It is cached for each camera, so that further renderings copy nothing."""
     by_device = _views.setdefault(camera, {})
     if device not in by_device:
         matrices = (camera.world_to_camera, camera.intrinsics)
@@ -67,27 +73,27 @@ def _view(camera: Camera, device: torch.device) -> _View:
 
 
 def has_gsplat() -> bool:
-    """Whether gsplat is installed; nothing of it is imported."""
+    """Return True if gsplat is installed, without importing it."""
     return importlib.util.find_spec("gsplat") is not None
 
 
 def load_gsplat(say: Callable[[str], None]) -> None:
-    """Import gsplat and its kernels, which compiles them where that has not been done yet.
+    """Import gsplat and its kernels, which are compiled at the first import.
 
-    Both versions compile when ``gsplat.cuda._backend`` is first imported, and leave ``None`` there where they find no
-    CUDA toolkit; a failed compilation is whatever exception the compiler's driver raises.
+    Both versions compile when ``gsplat.cuda._backend`` is first imported. Without a CUDA toolkit they set the kernels
+    to ``None``. A failed compilation raises any exception of the compiler's driver.
 
     Args:
-        say: takes a line for the user once compiling has begun.
+        say: receives a message for the user when a compilation is in progress.
 
     Raises:
-        PolarguideError: gsplat is not installed, or its kernels can be neither loaded nor compiled.
+        PolarguideError: gsplat is not installed, or its kernels cannot be loaded and compiled.
     """
     if not has_gsplat():
         raise PolarguideError(
             "--device cuda",
             expected="the package gsplat",
-            found="that it is not installed",
+            found="no such package",
             remedy=f"Install it with {install_extra('cuda')} and repeat the command, or use --device cpu.",
         )
     notice = "compiling gsplat's CUDA kernels; this takes minutes, once for each machine and PyTorch ..."
@@ -97,7 +103,7 @@ def load_gsplat(say: Callable[[str], None]) -> None:
     try:
         _add_headers()
         kernels = importlib.import_module("gsplat.cuda._backend")._C
-    except Exception as error:  # compilers, loaders and their drivers raise all kinds
+    except Exception as error:  # compilers, loaders and their drivers raise any exception
         lines = [line for line in str(error).splitlines() if line.strip()] or [type(error).__name__]
         cause = next((line for line in lines if "error" in line.lower()), lines[0])
         raise _no_kernels(cause.strip()[:200]) from error
@@ -108,9 +114,9 @@ def load_gsplat(say: Callable[[str], None]) -> None:
 
 
 def _add_headers() -> None:
-    """Add the headers of PyTorch's CUDA packages to the compiler's path where the toolkit lacks them.
+    """Add the headers of PyTorch's CUDA packages to the compiler's path if the toolkit lacks them.
 
-    PyTorch's own headers include those of cuBLAS, cuSOLVER and cuSPARSE, which a bare compiler package lacks.
+    PyTorch's headers include headers of cuBLAS, cuSOLVER and cuSPARSE, which a bare compiler package lacks.
     """
     from torch.utils.cpp_extension import CUDA_HOME
 
@@ -151,7 +157,7 @@ def _project(splats: Splats, camera: Camera) -> _Projected:
         *size,
         eps2d=BLUR,
         near_plane=NEAR_PLANE,
-        opacities=splats.opacities.detach(),  # for the size of the box, and to cull what is too faint
+        opacities=splats.opacities.detach(),  # for the size of the box and for culling
     )
     columns, rows = (-(-side // TILE) for side in size)
     _, keys, order = gsplat.isect_tiles(
@@ -162,7 +168,7 @@ def _project(splats: Splats, camera: Camera) -> _Projected:
 
 
 def _blend(projected: _Projected, features: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
-    """Pictures [H, W, D] and alpha [H, W] of features [N, D]."""
+    """Blend features [N, D] to a picture [H, W, D] and alpha [H, W]."""
     channels = features.shape[1]
     padding = next(count for count in COMPILED if count >= channels) - channels
     if padding:
@@ -182,9 +188,9 @@ def _blend(projected: _Projected, features: Tensor, camera: Camera) -> tuple[Ten
 
 
 class _AlphaAlone(torch.autograd.Function):
-    """Alpha that is known already; its gradient is found by blending nothing a second time, if it is asked for.
+    """Alpha that was computed before; its gradient, if needed, is computed by blending a zero channel.
 
-    So a statistic over all channels costs nothing, as long as no loss depends on alpha.
+    So a statistic over all channels costs nothing unless a loss depends on alpha.
     """
 
     @staticmethod
@@ -208,8 +214,8 @@ class _AlphaAlone(torch.autograd.Function):
         with torch.enable_grad():
             leaves = [t.detach().requires_grad_() for t in ctx.saved_tensors]
             projected = ctx.projected._replace(means2d=leaves[0], conics=leaves[1], opacities=leaves[2])
-            nothing = leaves[0].new_zeros(leaves[0].shape[1], 1)
-            _, alpha = _blend(projected, nothing, ctx.camera)
+            zeros = leaves[0].new_zeros(leaves[0].shape[1], 1)
+            _, alpha = _blend(projected, zeros, ctx.camera)
             gradients = torch.autograd.grad(alpha, leaves, grad)
         return (*gradients, None, None, None)
 
@@ -217,12 +223,12 @@ class _AlphaAlone(torch.autograd.Function):
 def _blend_with_statistic(
     projected: _Projected, features: Tensor, camera: Camera, statistic: ScreenStatistic
 ) -> tuple[Tensor, Tensor]:
-    """``_blend``, with the statistic filled by the backward pass.
+    """Blend features, and let the backward pass fill the statistic.
 
-    gsplat's gradient of the projected means sums over all channels. But channels blend independently of each other, so
-    those of the statistic are blended in a call of their own, with a copy of the projected means: the gradient of the
-    copy is the statistic, exactly, and both gradients add up to the whole. This evaluates the alphas of every Gaussian
-    and pixel twice; where all channels count, it costs nothing.
+    gsplat's gradient of the projected means is a sum over all channels. Channels are blended independently of each
+    other. So a separate call blends the channels of the statistic with a copy of the projected means. The gradient of
+    the copy is exactly the statistic, and the sum of both gradients is the whole gradient. Alphas of each Gaussian and
+    pixel are evaluated twice, but only once if the statistic has all channels.
     """
     chosen = list(statistic.channels)
     others = [channel for channel in range(features.shape[1]) if channel not in chosen]
@@ -246,7 +252,7 @@ def _blend_with_statistic(
 
 
 def _channels(features: Tensor, chosen: list[int]) -> Tensor:
-    """Some channels of [N, D], without an index that would be copied to the device."""
+    """Return some channels of [N, D] without an index, which would be copied to the device."""
     first = chosen[0]
     last = chosen[-1] + 1
     if chosen == list(range(first, last)):
@@ -255,7 +261,7 @@ def _channels(features: Tensor, chosen: list[int]) -> Tensor:
 
 
 def _sorted_channels(picture: Tensor, channels: list[int]) -> Tensor:
-    """A picture whose last axis holds these channels, with the channels in order."""
+    """Sort the last axis of a picture, which has these channels, by channel."""
     if channels == sorted(channels):
         return picture
     return torch.stack([picture[..., channels.index(k)] for k in range(len(channels))], dim=-1)
@@ -268,7 +274,7 @@ def rasterize_cuda(
     statistic: ScreenStatistic | None = None,
     still: tuple[int, ...] = (),
 ) -> Rasterized:
-    """See ``polarguide.raster.interface``, and the module for the differences. CUDA tensors, float32."""
+    """Splat Gaussians on a GPU in float32; see ``Rasterize``, and the module for differences."""
     check_shapes(splats, statistic, still)
     projected = _project(splats, camera)
     if statistic is not None and torch.is_grad_enabled() and projected.means2d.requires_grad:
@@ -277,7 +283,7 @@ def rasterize_cuda(
         picture, alpha = _blend(projected, splats.features, camera)
     again = None
     if still:
-        # A blend of its own, since gsplat's kernel has one gradient for all channels.
+        # A separate blend, because gsplat's kernel has one gradient for all channels.
         unmoved = _Projected(*(t.detach() for t in projected))
         again, _ = _blend(unmoved, _channels(splats.features, list(still)), camera)
     radii = projected.radii[0].amax(dim=-1).to(splats.means.dtype)

@@ -1,12 +1,13 @@
-"""The interface of the rasterizers.
+"""Interface of the rasterizers.
 
-``rasterize(splats, camera)`` splats N Gaussians with D feature channels each into one picture. It takes tensors, never
-a scene, and knows nothing of colors: base color, normal, strength or depth are channels like any other.
+``rasterize(splats, camera)`` splats N Gaussians with D feature channels each into one picture. Its inputs are tensors.
+Base color, normal, strength and depth are channels like any other.
 
-Definition, the same in every backend up to the differences that the backend's module names: EWA projection of the
-covariance (Zwicker et al. 2001; Kerbl et al. 2023, Eq. 5) with 0.1 px^2 added (there 0.3), alpha = min(0.99, opacity *
-exp(-d^T conic d / 2)), contributions with alpha < 1/255 dropped, a pixel ends before the Gaussian that would bring
-its transmittance below 1e-4, front to back in order of camera depth (ties: by index). Behind the last Gaussian is 0.
+All backends have the same definition, apart from the differences that their modules name. The covariance has an EWA
+projection (Zwicker et al. 2001; Kerbl et al. 2023, Eq. 5) with 0.1 px^2 added (there 0.3). Gaussians are blended front
+to back in order of camera depth; ties by index. Alpha is min(0.99, opacity * exp(-d^T conic d / 2)), and contributions
+with alpha < 1/255 are dropped. A pixel ends before the Gaussian that would reduce its transmittance below 1e-4. The
+background is 0.
 """
 
 from __future__ import annotations
@@ -21,17 +22,24 @@ from polarguide.core.errors import PolarguideError
 from polarguide.geometry.camera import Camera
 
 NEAR_PLANE = 0.01
+"""Camera depth below which Gaussians are culled, in world units."""
 BLUR = 0.1
+"""Variance added to projected covariances, in squared pixels."""
 MINIMUM_ALPHA = 1.0 / 255.0
+"""Alpha below which a contribution is dropped."""
 MAXIMUM_ALPHA = 0.99
+"""Upper bound of the alpha of one Gaussian."""
 MINIMUM_TRANSMITTANCE = 1e-4
-# The Jacobian is taken at most this share of the picture's size outside the picture, where the affine
-# approximation of the projection breaks down.
+"""Transmittance at which a pixel ends."""
 JACOBIAN_MARGIN = 0.15
+"""Maximum distance from the picture at which the Jacobian is evaluated, as a share of the picture's size.
+
+Farther outside, the affine approximation of the projection breaks down.
+"""
 
 
 class Splats(NamedTuple):
-    """Gaussians as a rasterizer takes them.
+    """Gaussians as input of a rasterizer.
 
     Attributes:
         means: [N, 3] world positions.
@@ -49,15 +57,15 @@ class Splats(NamedTuple):
 
 
 class Rasterized(NamedTuple):
-    """A splatted picture.
+    """Splatted picture.
 
     Attributes:
         features: [H, W, D], the blended channels.
         alpha: [H, W] in [0, 1], 1 - transmittance.
-        radii: [N] pixels, three standard deviations of the wider axis of each projected Gaussian, or what the
-            backend's module says; 0 where culled.
-        still: [H, W, S] the channels that were asked for once more, with a gradient on the Gaussians' features alone:
-            it changes what they show, and neither moves nor fades them. None: none was asked for.
+        radii: [N] pixels, three standard deviations of the wider axis of each projected Gaussian; 0 if culled. The
+            modules of backends name differences.
+        still: [H, W, S] a second copy of the requested channels, with a gradient on the Gaussians' features alone.
+            None: not requested.
     """
 
     features: Tensor
@@ -68,13 +76,13 @@ class Rasterized(NamedTuple):
 
 @dataclass
 class ScreenStatistic:
-    """Asks for the gradient of the loss with respect to the projected means, through some channels alone.
+    """Gradient of the loss with respect to the projected means, through some channels alone.
 
-    Densification needs the positional gradient of the colors alone: normals and strengths do not count (Ye et al.
-    2024). The backward pass of the ``rasterize`` call that it is given to fills it.
+    Densification needs the positional gradient of the colors, without normals and strengths (Ye et al. 2024). The
+    backward pass of a ``rasterize`` call fills the statistic.
 
     Attributes:
-        channels: which feature channels count.
+        channels: feature channels through which the gradient passes.
         gradient: [N, 2] in loss per pixel after the backward pass, None before.
     """
 
@@ -83,17 +91,17 @@ class ScreenStatistic:
 
 
 class Rasterize(Protocol):
-    """The signature of a backend.
+    """Signature of a backend.
 
     Args:
         splats: the Gaussians.
         camera: the view.
-        statistic: filled by the backward pass, if given.
-        still: channels that the result has once more, see ``Rasterized``.
+        statistic: statistic for the backward pass to fill.
+        still: channels of which the result has a second copy, see ``Rasterized``.
 
     Raises:
-        PolarguideError: shapes that do not fit, or values that are not finite (checked only where that does not mean
-            waiting for the device).
+        PolarguideError: a shape does not fit, or a value is not finite. The CUDA backend does not check values, because
+            it would wait for the device.
     """
 
     def __call__(
@@ -107,14 +115,14 @@ class Rasterize(Protocol):
 
 
 class Backend(NamedTuple):
-    """A device and the rasterizer that runs on it."""
+    """Device and the rasterizer that runs on it."""
 
     device: torch.device
     rasterize: Rasterize
 
 
 def check_shapes(splats: Splats, statistic: ScreenStatistic | None, still: tuple[int, ...] = ()) -> None:
-    """Check that the shapes fit each other, and that the channels of the statistic and the still ones exist.
+    """Check that the shapes fit each other, and that the channels of the statistic and of the copy exist.
 
     Raises:
         PolarguideError: a shape does not fit, or a channel does not exist.
@@ -124,22 +132,22 @@ def check_shapes(splats: Splats, statistic: ScreenStatistic | None, still: tuple
     shapes = ((count, 3), (count, 4), (count, 3), (count,), (count, channels))
     for name, tensor, shape in zip(Splats._fields, splats, shapes, strict=True):
         if tuple(tensor.shape) != shape:
-            remedy = "Give every tensor one entry for each Gaussian."
+            remedy = "Pass tensors with one entry for each Gaussian."
             raise refusal(name, f"shape {list(shape)}", str(list(tensor.shape)), remedy)
     if not 1 <= channels <= 32:
         raise refusal("features", "1 to 32 channels", str(channels), "Split the channels.")
     for name, chosen in (("statistic", statistic.channels if statistic else ()), ("still", still)):
         if len(set(chosen)) < len(chosen) or not all(0 <= channel < channels for channel in chosen):
-            remedy = "Name channels that exist, each once."
+            remedy = "Specify existing channels, each once."
             raise refusal(name, f"different channels below {channels}", str(chosen), remedy)
 
 
 def not_finite(name: str, index: int) -> PolarguideError:
-    """The error for a NaN or an infinity in the tensor ``name`` of the Gaussian ``index``."""
-    remedy = "A diverged optimization: lower the learning rate or resume from an earlier checkpoint."
+    """Return the error for a NaN or an infinity in the tensor ``name`` of the Gaussian ``index``."""
+    remedy = "The optimization diverged: lower the learning rate or resume from an earlier checkpoint."
     return refusal(name, "finite numbers", f"NaN or infinity in Gaussian {index}", remedy)
 
 
 def refusal(name: str, expected: str, found: str, remedy: str) -> PolarguideError:
-    """The error for the argument ``name`` of a rasterizer."""
+    """Return the error for the argument ``name`` of a rasterizer."""
     return PolarguideError(f"rasterize({name})", expected=expected, found=found, remedy=remedy)

@@ -1,9 +1,10 @@
-"""Pictures whose pixels are smaller than those of the training.
+"""Pictures with smaller pixels than in the training.
 
-A training sees Gaussians through the blur of its pixels (``BLUR`` in squared pixels) and makes them as much narrower.
-A picture with smaller pixels blurs less, so that the same Gaussians show as needles with gaps between them. It is drawn
-with the blur that the training had: that of the nearest pixel that any training view has at the Gaussian. Yu et al.
-2024 (Mip-Splatting) limit Gaussians by the same nearest pixel while they are trained.
+The rasterizer blurs Gaussians by the size of a pixel (``BLUR`` in squared pixels), so a training makes them narrower.
+With smaller pixels the blur is smaller, and the same Gaussians look like needles with gaps between them. Such a
+picture is
+drawn with the blur of the training: the blur of the smallest pixel at the Gaussian in any training view. Mip-Splatting
+(Yu et al. 2024) limits Gaussians by the same pixel during the training.
 """
 
 from __future__ import annotations
@@ -18,19 +19,19 @@ from polarguide.raster.interface import BLUR, NEAR_PLANE, Splats
 
 
 def _pixel_sizes(depth: Tensor, camera: Camera) -> Tensor:
-    """Sides of a pixel in the world at camera depths [N]."""
+    """Return the side of a pixel at camera depths [N], in world units."""
     return depth.clamp(min=NEAR_PLANE) / (camera.fx * camera.fy) ** 0.5
 
 
 @torch.no_grad()
 def footprints(means: Tensor, cameras: Iterable[Camera]) -> Tensor:
-    """Sides of the smallest pixel at each Gaussian, among the cameras that have its center in the picture.
+    """Return the side of the smallest pixel at each Gaussian, among the cameras that show its center.
 
     Args:
         means: [N, 3] world positions. cameras: cameras of the training views.
 
     Returns:
-        [N] in world units; 0 where no camera has it in the picture.
+        [N] in world units; 0 if no camera shows the Gaussian.
     """
     smallest = torch.full_like(means[:, 0], torch.inf)
     for camera in cameras:
@@ -41,15 +42,15 @@ def footprints(means: Tensor, cameras: Iterable[Camera]) -> Tensor:
 
 
 def as_trained(splats: Splats, camera: Camera, footprints: Tensor) -> Splats:
-    """Gaussians with the blur of the training's pixels where those of a camera are smaller; others as they are.
+    """Add the blur of the training's pixels to Gaussians if the camera's pixels are smaller.
 
     Args:
-        splats: N Gaussians. camera: camera of the picture. footprints: [N], see above.
+        splats: N Gaussians. camera: camera of the picture. footprints: [N] as returned by ``footprints``.
 
     Returns:
-        With variances along all axes larger by what the blur of the picture's own pixel lacks.
+        Gaussians with variances along all axes increased by the difference between both blurs.
     """
     pose = camera.pose(splats.means.dtype, splats.means.device)
     own = _pixel_sizes((splats.means - pose.center) @ pose.rotation[2], camera)
-    lacking = BLUR * (footprints.square() - own.square()).clamp(min=0)
-    return splats._replace(scales=(splats.scales.square() + lacking[:, None]).sqrt())
+    difference = BLUR * (footprints.square() - own.square()).clamp(min=0)
+    return splats._replace(scales=(splats.scales.square() + difference[:, None]).sqrt())

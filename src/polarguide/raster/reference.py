@@ -1,6 +1,6 @@
-"""The reference implementation: the definition of the rasterizer in plain torch, for any dtype and device.
+"""Reference implementation of the rasterizer in plain PyTorch, for any dtype and device.
 
-Every Gaussian is evaluated at every pixel, so memory grows as N x H x W: for tests and tiny pictures.
+It evaluates each Gaussian at each pixel, so memory grows as N x H x W. It is meant for tests and tiny pictures.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from polarguide.raster.interface import (
 
 
 def _project(splats: Splats, camera: Camera) -> tuple[Tensor, Tensor, Tensor]:
-    """Projected means [N, 2], covariances [N, 2, 2] with the blur, and camera depths [N]."""
+    """Return projected means [N, 2], covariances [N, 2, 2] with the blur, and camera depths [N]."""
     means = splats.means
     rotation = camera.rotation.to(means)
     local = means @ rotation.T + camera.translation.to(means)
@@ -58,7 +58,7 @@ def rasterize_reference(
     statistic: ScreenStatistic | None = None,
     still: tuple[int, ...] = (),
 ) -> Rasterized:
-    """See ``polarguide.raster.interface``; differentiable by autograd, exact but slow."""
+    """Splat Gaussians, differentiable by autograd, exact but slow; see ``Rasterize``."""
     check_shapes(splats, statistic, still)
     for name, tensor in splats._asdict().items():
         bad = (~torch.isfinite(tensor)).nonzero()
@@ -105,13 +105,13 @@ def rasterize_reference(
 
 
 def _with_statistic(image: Tensor, means2d: Tensor, statistic: ScreenStatistic) -> Tensor:
-    """The same picture; when its gradient arrives, the statistic is filled."""
+    """Return the same picture; its gradient fills the statistic."""
 
     def fill(gradient: Tensor) -> None:
         chosen = torch.zeros_like(gradient)
         chosen[..., list(statistic.channels)] = gradient[..., list(statistic.channels)]
         (statistic.gradient,) = torch.autograd.grad(image, means2d, chosen, retain_graph=True)
 
-    result = image.clone()  # a node of its own, so that the hook does not call itself
+    result = image.clone()  # a separate node, so that the hook does not call itself
     result.register_hook(fill)
     return result

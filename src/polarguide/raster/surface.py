@@ -1,9 +1,9 @@
-"""Where the surface is that a splatted picture shows, and which way it faces: what lies around the median depth.
+"""Surface of a splatted picture: position and normal around the median depth of each pixel.
 
-A blended depth lies between the surfaces that a pixel shows at an edge, and a blended normal between theirs. Those of
-the Gaussians around the pixel's median depth are of one of them.
+At an edge a pixel shows two surfaces. Its blended depth and normal lie between them. The means over Gaussians around
+the median depth belong to one of the surfaces.
 
-``alpha_in_front`` tells how much of a pixel lies in front of a given depth.
+``alpha_in_front`` returns the share of a pixel in front of a given depth.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ from polarguide.raster.cpu import finite, native_rasterizer
 from polarguide.raster.interface import Rasterize, Splats
 
 WIDTH = 0.02
-"""Standard deviation of what is taken around the median depth, as a share of it."""
+"""Standard deviation of the weights around the median depth, as a share of this depth."""
 
 
 class SurfacePicture(NamedTuple):
-    """The surface around the median depth of each pixel.
+    """Surface around the median depth of each pixel.
 
     Attributes:
-        directions: [H, W, 3] mean of the Gaussians' directions, at most unit; zero where there is nothing.
-        depth: [H, W] mean of their camera depths; 0 where there is nothing.
+        directions: [H, W, 3] mean of the Gaussians' directions, of at most unit length; zero without Gaussians.
+        depth: [H, W] mean of their camera depths; 0 without Gaussians.
     """
 
     directions: Tensor
@@ -35,54 +35,54 @@ class SurfacePicture(NamedTuple):
 
 @torch.no_grad()
 def surface_picture(splats: Splats, camera: Camera) -> SurfacePicture:
-    """The weighted means of directions and camera depths around the median depth.
+    """Return the weighted means of directions and camera depths around the median depth.
 
-    The median depth z_m of a pixel is that of the Gaussian with which the blended weights w_i, front to back, reach
-    half of their sum. Weights of the means are w_i exp(-(z_m / z_i - 1)^2 / (2 s^2)), s = ``WIDTH``.
+    The median depth z_m of a pixel is the depth of the Gaussian at which the blended weights w_i, summed front to back,
+    reach half of their sum. The means have weights w_i exp(-(z_m / z_i - 1)^2 / (2 s^2)), s = ``WIDTH``.
 
-    It is computed by the native kernels, wherever the Gaussians are: it is for outputs, not for training.
+    Native kernels on the CPU compute it for Gaussians on any device. It serves outputs, not training.
 
     Args:
-        splats: the Gaussians, their features [N, 3] directions; float32. camera: the view.
+        splats: the Gaussians, float32; their features are directions [N, 3]. camera: the view.
 
     Returns:
-        Both on the device of the Gaussians, without gradients.
+        Surface on the device of the Gaussians, without gradients.
 
     Raises:
         PolarguideError: a value of the Gaussians is not finite.
     """
     pose = camera.pose(splats.means.dtype, splats.means.device)
     depth = ((splats.means - pose.center) @ pose.rotation[2])[:, None]
-    whole = splats._replace(features=torch.cat((splats.features, depth), dim=1))
-    rasterizer = native_rasterizer(camera, whole.features.shape[1], None)
-    out = torch.empty(camera.height, camera.width, whole.features.shape[1])
-    rasterizer.surface(*finite(*whole), WIDTH, out)
+    features = torch.cat((splats.features, depth), dim=1)
+    rasterizer = native_rasterizer(camera, features.shape[1], None)
+    out = torch.empty(camera.height, camera.width, features.shape[1])
+    rasterizer.surface(*finite(*splats._replace(features=features)), WIDTH, out)
     directions, depth = out.to(splats.means.device).split((3, 1), dim=-1)
     return SurfacePicture(directions, depth[..., 0])
 
 
 SLABS = 31
-"""Depths that are told apart in one pass; with what lies behind them they fill a rasterizer's channels."""
+"""Number of depths that one pass resolves. With the space behind them they fill the channels of a rasterizer."""
 PASSES = 4
+"""Number of passes."""
 
 
 @torch.no_grad()
 def alpha_in_front(splats: Splats, camera: Camera, depth: Tensor, rasterize: Rasterize) -> Tensor:
-    """The blended weight of the Gaussians whose centers are nearer than a depth, over the pixel's whole weight.
+    """Return the share of a pixel's blended weight from Gaussians with centers nearer than a depth.
 
-    The depth at which this share reaches one half is the pixel's median depth. The rasterizer blends channels and
-    not conditions, so the Gaussians are sorted into slabs of depth, one channel each: the share is then known at the
-    slabs' ends. Each pass puts these where pixels' own depths lie among those that are still undecided, that is whose
-    slab's two ends lie on different sides of one half, and that do not lie at an end themselves. What is undecided
-    after the last pass is read off the straight line between the ends; its slab then is at most a few thousandths of
-    its depth wide.
+    The median depth of a pixel is the depth at which this share is one half. The Gaussians are sorted into slabs of
+    depth, one channel each, so that a rasterizer returns the share at the ends of the slabs. A pixel is decided if the
+    shares at both ends of its slab lie on the same side of one half, or if its depth lies at an end. Each pass chooses
+    slabs by the depths of the remaining pixels. After the last pass the share of a remaining pixel is interpolated
+    linearly between the ends of its slab, which then is at most a few thousandths of its depth wide.
 
     Args:
-        splats: the Gaussians; features are not read. camera: the view.
+        splats: the Gaussians; features are ignored. camera: the view.
         depth: [H, W] camera depths; pixels with a depth of 0 or less are skipped. rasterize: rasterizer of the backend.
 
     Returns:
-        [H, W] in [0, 1]; 0 where nothing is blended, and in skipped pixels.
+        [H, W] in [0, 1]; 0 without Gaussians and for skipped pixels.
     """
     pose = camera.pose(splats.means.dtype, splats.means.device)
     places = ((splats.means - pose.center) @ pose.rotation[2])[:, None]
@@ -117,7 +117,7 @@ def alpha_in_front(splats: Splats, camera: Camera, depth: Tensor, rasterize: Ras
 
 
 def _spread(depths: Tensor) -> Tensor:
-    """At most ``SLABS`` depths, ascending, that have equally many of the given ones between them."""
+    """Return at most ``SLABS`` ascending depths that divide the given depths into groups of equal size."""
     ordered = depths.flatten().sort().values
     places = torch.linspace(0, len(ordered) - 1, SLABS).round().long()
     return ordered[places].unique()

@@ -23,7 +23,7 @@ from polarguide.optics.color import srgb_encode, srgb_slope
 from polarguide.raster import Backend
 from polarguide.raster.magnification import as_trained
 from polarguide.raster.surface import alpha_in_front
-from polarguide.shading.gbuffer import RenderRequest, render, splats
+from polarguide.shading.gbuffer import RenderRequest, render, single_colors, splats
 from polarguide.shading.model import Light, Parameters, ShadingModel
 from polarguide.shading.result import LAYERS, POLARIZED, RenderResult
 from polarguide.training.recipe import Recipe
@@ -195,7 +195,8 @@ def _toward(gaussians: Parameters, light: Light, shading: ShadingModel, directio
     for direction in directions.to(means.device):
         # A camera far behind each Gaussian sees it along one direction.
         facing = torch.where((normals @ direction)[:, None] > 0, -normals, normals)
-        colors.append(shading.colors(gaussians, light, direction.expand(len(means), 3), facing))
+        rays = direction.expand(len(means), 3)
+        colors.append(single_colors(gaussians, light, shading, rays, facing))
     return colors
 
 

@@ -107,7 +107,7 @@ def report_polarizers(out: Path, scene: Scene, polarizers: Polarizers, reporter:
         first = wrong[0]
         reporter.warn(
             f"{named(wrong)} contradict their angles: {names[first.view][first.number]} is specified at "
-            f"{first.specified.words} degrees and looks as if at {first.angle:.0f}. {command('inspect', scene.root)} "
+            f"{first.specified.label} degrees and looks as if at {first.angle:.0f}. {command('inspect', scene.root)} "
             "compares all angles separately; correct the names of the files or angles.csv where it agrees."
         )
 

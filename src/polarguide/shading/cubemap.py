@@ -1,6 +1,6 @@
-"""A cubemap of learned light: seamless bilinear look-up, differentiable in texels and directions.
+"""Cubemaps of learned light: seamless bilinear look-up, differentiable in texels and directions.
 
-Faces are in OpenGL's order and orientation. On each, s runs with the columns and t with the rows, both from -1 to 1:
+Faces have OpenGL's order and orientation. On each face s increases along columns and t along rows, from -1 to 1:
 
 ==== ===== ===== =====
 face major s     t
@@ -13,12 +13,12 @@ face major s     t
 5    -z    -x    -y
 ==== ===== ===== =====
 
-so that the direction of face 0 at (s, t) is (1, -t, -s). Seen from within the cube, pictures are upright with +y up.
-At a face's edge the taps beyond it are the texels of the neighboring face; beyond a corner, where only three faces
-meet, the missing tap is the mean of their three corner texels. So the look-up is continuous everywhere. On the CPU in
-float32 it is a native kernel; ``cubemap_lookup_reference`` is its reference implementation in plain torch.
+The direction of face 0 at (s, t) is (1, -t, -s). From within the cube, pictures are upright with +y up. Beyond an
+edge of a face the taps are texels of the neighboring face. Beyond a corner, where three faces meet, the tap is the
+mean of their three corner texels. So the look-up is continuous everywhere. On the CPU in float32 it is a native
+kernel; ``cubemap_lookup_reference`` is its reference implementation in plain torch.
 
-``box_mips`` are box-filtered copies, and ``mip_lookup`` interpolates between two of them (trilinear).
+``box_mips`` returns box-filtered copies, and ``mip_lookup`` interpolates between two of them (trilinear).
 """
 
 from __future__ import annotations
@@ -34,7 +34,6 @@ from torch.autograd.function import once_differentiable
 from polarguide import _native
 from polarguide.core.native import fits
 
-# Per face: axis and sign of the major component, of s and of t.
 _FACES = (
     (0, 1, 2, -1, 1, -1),
     (0, -1, 2, 1, 1, -1),
@@ -43,10 +42,11 @@ _FACES = (
     (2, 1, 0, 1, 1, -1),
     (2, -1, 0, -1, 1, -1),
 )
+"""Axis and sign of the major component, of s and of t, for each face."""
 
 
 def _face_points(coordinates: Tensor, distance: int) -> Tensor:
-    """Points [6, n, n, 3] on (extended) faces ``distance`` from the center, at coordinates [n] along s and t."""
+    """Return points [6, n, n, 3] on extended faces at ``distance`` from the center, for coordinates [n] of s and t."""
     t, s = torch.meshgrid(coordinates, coordinates, indexing="ij")
     points = torch.empty(6, *s.shape, 3, dtype=coordinates.dtype)
     for face, (axis, sign, s_axis, s_sign, t_axis, t_sign) in enumerate(_FACES):
@@ -57,21 +57,27 @@ def _face_points(coordinates: Tensor, distance: int) -> Tensor:
 
 
 def texel_directions(resolution: int) -> Tensor:
-    """Unit directions of the texel centers, [6, R, R, 3] float32; R at least 1."""
+    """Return unit directions of the texel centers, [6, R, R, 3] float32; R at least 1."""
     coordinates = (torch.arange(resolution) + 0.5) * 2 / resolution - 1
     return torch.nn.functional.normalize(_face_points(coordinates, 1), dim=-1)
 
 
 class _Ring(NamedTuple):
-    """The faces with a ring of texels around each, [6, R + 2, R + 2] flattened, as indices into [6, R, R]."""
+    """Indices into texels [6, R, R] of the faces with a ring of neighboring texels, [6, R + 2, R + 2].
 
-    source: Tensor  # [6 (R + 2)^2]; at a corner, the face's own corner texel
-    corners: Tensor  # [24] places in the ring
-    around: Tensor  # [24, 3] the texels that meet there
+    Attributes:
+        source: [6 (R + 2)^2] texel of each place; at a corner the face's own corner texel.
+        corners: [24] places of the corners.
+        around: [24, 3] texels that meet at each corner.
+    """
+
+    source: Tensor
+    corners: Tensor
+    around: Tensor
 
 
 def _texel_index(face: Tensor, points: Tensor, resolution: int) -> Tensor:
-    """Flat texel of points [..., 3] in half texels from the cube's center, on the given faces [...]."""
+    """Return the flat index of texels at points [..., 3] on faces [...], in half texels from the cube's center."""
     table = torch.tensor(_FACES)[face]
     s = table[..., 3] * points.gather(-1, table[..., 2:3])[..., 0]
     t = table[..., 5] * points.gather(-1, table[..., 4:5])[..., 0]
@@ -82,9 +88,9 @@ def _texel_index(face: Tensor, points: Tensor, resolution: int) -> Tensor:
 
 @lru_cache(maxsize=8)
 def _ring(resolution: int, device: torch.device) -> _Ring:
-    """A texel beyond an edge is the one that touches the edge from the other side."""
+    """Return the ring: beyond an edge lies the texel that touches the edge on the neighboring face."""
     last = resolution - 1
-    place = 2 * torch.arange(-1, resolution + 1) - last  # in half texels from the middle of a face
+    place = 2 * torch.arange(-1, resolution + 1) - last  # half texels from the middle of a face
     inner = place.clamp(-last, last)
     face = torch.arange(6)[:, None, None].expand(6, resolution + 2, resolution + 2)
     own = _texel_index(face, _face_points(inner, resolution), resolution)
@@ -93,7 +99,7 @@ def _ring(resolution: int, device: torch.device) -> _Ring:
     outer = _face_points(place, last)
 
     def across(axis_column: int) -> Tensor:
-        """The texel over the edge in s (column 2 of the table) or t (column 4)."""
+        """Return the texels beyond the edge in s (column 2 of the table) or t (column 4)."""
         axis = torch.tensor(_FACES)[face][..., axis_column]
         negative = outer.gather(-1, axis[..., None])[..., 0] < 0
         return _texel_index(2 * axis + negative.long(), points, resolution)
@@ -108,12 +114,12 @@ def _ring(resolution: int, device: torch.device) -> _Ring:
 
 @lru_cache(maxsize=4)
 def _face_table(device: torch.device) -> Tensor:
-    """``_FACES`` on a device, [6, 6]."""
+    """Return ``_FACES`` on a device, [6, 6]."""
     return torch.tensor(_FACES, device=device)
 
 
 def face_coordinates(directions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Face [P], and s and t [P] in [-1, 1], of directions [P, 3]; ties go to the earlier axis, zero to +x's center."""
+    """Return face [P], s and t [P] in [-1, 1] of directions [P, 3]; ties go to the first axis, zero to +x's center."""
     x, y, z = directions.abs().unbind(-1)
     axis = torch.where((x >= y) & (x >= z), 0, torch.where(y >= z, 1, 2))
     major = directions.gather(-1, axis[:, None])[:, 0]
@@ -126,7 +132,7 @@ def face_coordinates(directions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def ringed_texels(texture: Tensor) -> Tensor:
-    """Texels [6, R, R, C] with a ring of their neighbors around each face, [6 (R + 2)^2, C]."""
+    """Return texels [6, R, R, C] with a ring of neighboring texels around each face, [6 (R + 2)^2, C]."""
     ring = _ring(texture.shape[1], texture.device)
     texels = texture.reshape(-1, texture.shape[-1])
     return texels[ring.source].index_put((ring.corners,), texels[ring.around].mean(dim=1))
@@ -138,37 +144,34 @@ def ringed_lookup(
     resolution: int | Tensor,
     begin: int | Tensor = 0,
 ) -> Tensor:
-    """Bilinear look-up of ringed texels at ``face_coordinates``, [P, C].
+    """Look up ringed texels bilinearly.
 
     Args:
-        ringed: [T, C], one cubemap's or several one after the other.
-        place: face, s and t, each [P].
-        resolution: R, of all or of each, [P] int64. begin: where in ``ringed`` the cubemap begins, likewise.
+        ringed: [T, C] texels of one or several cubemaps.
+        place: face, s and t of ``face_coordinates``, each [P].
+        resolution: R, a number or [P] int64. begin: first texel of the cubemap in ``ringed``, a number or [P] int64.
+
+    Returns:
+        [P, C].
     """
     channels = ringed.shape[-1]
     face, s, t = place
-    # Texel centers are at half-integers; one is added for the ring. A NaN reads cell 0 and stays in the fraction.
+    # Texel centers lie at half-integers, and the ring adds one. A NaN reads cell 0 and remains in the fraction.
     u = (s + 1) * (resolution / 2) + 0.5
     v = (t + 1) * (resolution / 2) + 0.5
-    column, row = (x.detach().nan_to_num(0).clamp(min=0).floor().long() for x in (u, v))
-    if isinstance(resolution, Tensor):
-        column = column.minimum(resolution)
-        row = row.minimum(resolution)
-    else:
-        column = column.clamp(max=resolution)
-        row = row.clamp(max=resolution)
+    column, row = (x.detach().nan_to_num(0).clamp(min=0).floor().long().clamp(max=resolution) for x in (u, v))
     fu = (u - column)[:, None]
     fv = (v - row)[:, None]
     first = (face * (resolution + 2) + row) * (resolution + 2) + column + begin
     second = first + resolution + 2
-    # index_select, not an index: its gradient adds atomically on a GPU, where that of an index sorts first.
+    # On a GPU the gradient of index_select adds atomically; the gradient of an index sorts first, which is slower.
     taps = [ringed.index_select(0, tap) for tap in (first, first + 1, second, second + 1)]
     top, bottom = (torch.lerp(a, b, fu.expand(-1, channels)) for a, b in (taps[:2], taps[2:]))
     return torch.lerp(top, bottom, fv.expand(-1, channels))
 
 
 def cubemap_lookup_reference(texture: Tensor, directions: Tensor) -> Tensor:
-    """The reference implementation of ``cubemap_lookup``: plain torch, any dtype and device."""
+    """Compute ``cubemap_lookup`` in plain torch, for any dtype and device: the reference implementation."""
     return ringed_lookup(ringed_texels(texture), face_coordinates(directions), texture.shape[1])
 
 
@@ -193,21 +196,21 @@ class _Lookup(torch.autograd.Function):
 
 
 def cubemap_lookup(texture: Tensor, directions: Tensor) -> Tensor:
-    """Seamless bilinear look-up, ``sum_k w_k(direction) texel_k`` over four taps; see the module for the faces.
+    """Look up a cubemap seamlessly and bilinearly: ``sum_k w_k(direction) texel_k`` over four taps.
 
-    The gradient with respect to a direction is that of the weights: it is constant along the ray, so orthogonal to
-    the direction, and jumps where the direction passes between cells of four texel centers. A direction of length
-    zero reads the middle of +x and gets no gradient; one with a NaN reads NaN.
+    The gradient with respect to a direction is the gradient of the weights. It is orthogonal to the direction, and
+    jumps between cells of four texel centers. A direction of length zero reads the middle of +x and gets no gradient.
+    A NaN in a direction returns NaN.
 
     Args:
-        texture: [6, R, R, C], R at least 1.
+        texture: [6, R, R, C], R at least 1; see the module for the faces.
         directions: [P, 3], of any length.
 
     Returns:
-        [P, C], differentiable in both; on the CPU the same bits for any number of threads.
+        [P, C], differentiable in both. On the CPU the number of threads does not change a bit.
 
     Raises:
-        ValueError: if a shape is not as above.
+        ValueError: a shape does not fit.
     """
     if (
         texture.ndim != 4
@@ -224,16 +227,17 @@ def cubemap_lookup(texture: Tensor, directions: Tensor) -> Tensor:
     return cubemap_lookup_reference(texture, directions)
 
 
-# Of the native look-up.
 MOST_LEVELS = 16
+"""Maximum number of mip levels of the native look-up."""
 MOST_CHANNELS = 64
+"""Maximum number of channels of the native look-up."""
 
 
 def box_mips(texture: Tensor) -> list[Tensor]:
-    """A cubemap and its box-filtered levels.
+    """Return a cubemap and its box-filtered levels.
 
-    Each level averages 2 x 2 texels of the one before within a face. Below one texel a face comes a last level, the
-    plain mean of all texels on every face, so that the coarsest light has no direction left.
+    Each level averages 2 x 2 texels of the previous level within a face. After the level with one texel per face comes
+    the mean of all texels, which does not depend on the direction.
 
     Args:
         texture: [6, R, R, C], R a power of two.
@@ -242,7 +246,7 @@ def box_mips(texture: Tensor) -> list[Tensor]:
         ``log2 R + 2`` textures of resolutions R, R / 2, ..., 1, and 1; differentiable.
 
     Raises:
-        ValueError: if the shape is not as above.
+        ValueError: the shape does not fit.
     """
     resolution = texture.shape[1] if texture.ndim == 4 else 0
     if (
@@ -288,10 +292,12 @@ def mips_backward(
     textures: bool,
     grad_light: Tensor | None = None,
 ) -> tuple[Tensor, Tensor, Sequence[Tensor | None]]:
-    """Gradients of the native look-up by directions, level and, with ``textures``, the levels; contiguous tensors.
+    """Return gradients of the native look-up with respect to directions, level and textures.
 
     Args:
-        grad: [P, C]. grad_light: in its place for all but the directions.
+        levels, directions, level: inputs of the look-up, contiguous.
+        grad: [P, C] gradient with respect to its result. textures: whether to compute gradients of the textures.
+        grad_light: [P, C] gradient used instead of ``grad`` for all but the directions.
     """
     to_directions = torch.empty_like(directions)
     if len(levels) == 1:
@@ -313,18 +319,18 @@ def mips_backward(
 
 
 def mip_lookup(levels: Sequence[Tensor], directions: Tensor, level: Tensor) -> Tensor:
-    """Look-up between mip levels: seamless bilinear on the two nearest, linear between them.
+    """Look up the two nearest mip levels seamlessly and bilinearly, and interpolate linearly between them.
 
-    On the CPU in float32 a native pass, up to 16 levels and 64 channels; ``mip_lookup_reference`` is its reference
-    implementation. The gradient with respect to ``level`` is the difference of the two levels, and 0 beyond the ends.
+    On the CPU in float32 a native pass serves up to 16 levels and 64 channels. The gradient with respect to ``level``
+    is the difference of the two levels, and 0 beyond the ends.
 
     Args:
-        levels: L textures as of ``box_mips``, [6, R_l, R_l, C].
+        levels: L textures [6, R_l, R_l, C] as returned by ``box_mips``.
         directions: [P, 3], of any length.
         level: [P], clamped to [0, L - 1].
 
     Returns:
-        [P, C], differentiable in all three; on the CPU the same bits for any number of threads.
+        [P, C], differentiable in all three. On the CPU the number of threads does not change a bit.
     """
     native = len(levels) <= MOST_LEVELS and 1 <= levels[0].shape[-1] <= MOST_CHANNELS
     if native and fits(directions, level, *levels):
@@ -335,19 +341,20 @@ def mip_lookup(levels: Sequence[Tensor], directions: Tensor, level: Tensor) -> T
 
 @lru_cache(maxsize=8)
 def _sizes(resolutions: tuple[int, ...], device: torch.device) -> tuple[Tensor, Tensor]:
-    """Resolutions of levels, and where each begins among their ringed texels, [L] int64 both."""
+    """Return the resolutions of levels and the first of their ringed texels, both [L] int64."""
     counts = [6 * (resolution + 2) ** 2 for resolution in resolutions]
     begins = [sum(counts[:level]) for level in range(len(counts))]
     return torch.tensor(resolutions, device=device), torch.tensor(begins, device=device)
 
 
 def mip_lookup_reference(levels: Sequence[Tensor], directions: Tensor, level: Tensor) -> Tensor:
-    """The reference implementation of ``mip_lookup``: plain torch, any dtype and device, without a loop over what is
-    found, since counting the directions of a level would wait for the device.
+    """Compute ``mip_lookup`` in plain torch, for any dtype and device: the reference implementation.
+
+    It does not loop over levels, because counting the directions of a level would wait for the device.
     """
     last = len(levels) - 1
     level = level.clamp(0, last)
-    # The last level is reached as the upper one of a pair, so that there is always a pair.
+    # The last level is always the upper level of a pair.
     lower = level.detach().nan_to_num(0).floor().long().clamp(max=max(0, last - 1))
     resolutions, begins = _sizes(tuple(texture.shape[1] for texture in levels), directions.device)
     ringed = torch.cat([ringed_texels(texture) for texture in levels])

@@ -9,15 +9,13 @@ from typing import Any, ClassVar, Literal
 import torch
 from torch import Tensor
 
-from polarguide import optics
 from polarguide.core.native import fits
-from polarguide.gaussians.gaussians import any_nonzero
 from polarguide.geometry.camera import Camera
+from polarguide.geometry.vectors import dot, unit
 from polarguide.optics import reflectances_from_cosine
 from polarguide.shading.cubemap import cubemap_lookup, mip_lookup
 from polarguide.shading.metal import (
     FIRST_REFLECTANCE,
-    metal_channels,
     metal_pixels,
     metalness_picture,
     reflectance,
@@ -26,67 +24,71 @@ from polarguide.shading.metal import (
 )
 from polarguide.shading.model import (
     MAXIMUM_LOG_LIGHT,
-    ChannelParameters,
+    Channels,
     GBuffer,
     Light,
     Parameter,
     Parameters,
     RadianceCubemap,
     ShadingModel,
-    harmonic_colors,
-    local_light,
     mirrored,
 )
-from polarguide.shading.native import reflect_arguments, reflect_reference, shade_native
+from polarguide.shading.native import shade_native
 from polarguide.shading.result import LAYERS
-from polarguide.shading.roughness import LEVELS, blended_blur, gltf_roughness, light_levels
-from polarguide.shading.surface import SurfaceProperty
+from polarguide.shading.roughness import LEVELS, gltf_roughness, light_levels
+from polarguide.shading.surface import SurfaceProperty, surface_channels
 
 Blend = Literal["lerp", "fresnel"]
 RESET_STRENGTH = 1e-3
-_NO_LIGHT = 1e-4  # radiance of black, so that its logarithm is finite
+"""Lower bound of strengths after a reset of the opacities."""
+_NO_LIGHT = 1e-4
+"""Radiance that stands for black, so that its logarithm is finite."""
 LOCAL_NOTE = (
-    "Turning the environment turns what is reflected from afar. What stands near is reflected by the Gaussians "
-    "themselves, which stay as they are."
+    "Turning the environment turns reflections of distant surroundings. Gaussians themselves hold reflections of near "
+    "surroundings, which do not turn."
 )
-METALNESS = SurfaceProperty("metalness", "metalness")
-REFLECTANCE = SurfaceProperty(
+"""Note on local light for readers of an export."""
+_REFLECTANCE = SurfaceProperty(
     "reflectance",
     "reflectance_logits",
     channels=3,
     activation=reflectance,
     inverse=reflectance_logits,
     initial=FIRST_REFLECTANCE,
-    slot="metal",
+    weight="metalness",
 )
-INDEX = SurfaceProperty("index", "index_offset")
-"""Offset of a Gaussian's refractive index from the run's."""
+_METALNESS = SurfaceProperty("metalness", "metalness", weight="metalness")
+_INDEX = SurfaceProperty("index", "index_offset", weight="index_offset")
+"""Offset of a Gaussian's refractive index from the index of the run."""
+_OWN = ("strength", "blur", "reflectance", "metalness", "index")
+"""Surface properties that ``DeferredShading.shade`` reads; others are blended to layers of their names."""
 
 
 @dataclass(frozen=True)
 class DeferredShading(ShadingModel):
-    """How base color and reflection make the picture.
+    """Deferred reflection: the G-buffer of a pixel mirrors a learned environment.
 
     Attributes:
         blend: "lerp": final = (1 - r) base + r sigmoid(environment), as in 3DGS-DR (Ye et al. 2024, Eq. 5);
-            "fresnel": final = base + r F(i) exp(environment), with F the unpolarized power reflectance of a
-            dielectric at the angle between ray and normal, so that strength can be a property of the surface.
-        local: whether Gaussians add light of their own to the environment's, a function of the mirrored direction:
-            what stands near, and what the far environment cannot say.
-        first_strength: reflection strength that Gaussians start with.
+            "fresnel": final = base + r F(i) exp(environment). F is the unpolarized power reflectance of a dielectric
+            at the angle between ray and normal, so that strength can be a property of the surface.
+        local: True if Gaussians add local light to the environment's: a function of the mirrored direction for near
+            surroundings, which a distant environment cannot represent.
+        first_strength: reflection strength before the first step.
         strength_rate: learning rate of the strengths.
-        local_rate: learning rate of the Gaussians' own light of degree 0; that of higher degrees is a twentieth.
+        local_rate: learning rate of local light of degree 0; higher degrees have a twentieth of it.
         environment_spread: first raw texels are uniform in plus or minus this.
         environment_rate: learning rate of the texels.
         environment_resolution: texels along a cube face's side.
-        rough: whether dielectrics have a roughness, too, or metals alone; with the blend "fresnel".
-        first_roughness: that Gaussians begin with, in (0, 1). roughness_rate: its learning rate.
-        metal: whether Gaussians can be metals, see ``shading.metal``; with the blend "fresnel".
-        indices: whether Gaussians can have refractive indices of their own (never learned); with the blend "fresnel".
-        metal_rate: learning rate of their reflectance.
+        rough: True: dielectrics have a roughness; False: only metals have one. Needs the blend "fresnel".
+        first_roughness: blur before the first step, in (0, 1). roughness_rate: its learning rate.
+        metal: True if Gaussians can be metals, see ``shading.metal``. Needs the blend "fresnel".
+        indices: True if Gaussians can have different refractive indices, which are never learned. Needs the blend
+            "fresnel".
+        metal_rate: learning rate of the metals' reflectance.
 
-    With the blend "fresnel" light is read from box-filtered levels of the radiance: at that of a
-    pixel's roughness, see ``shading.roughness``.
+    With the blend "fresnel" light is read from box-filtered mip levels of the radiance, at the level of a pixel's blur,
+    see ``shading.roughness``.
     """
 
     blend: Blend = "lerp"
@@ -108,22 +110,39 @@ class DeferredShading(ShadingModel):
 
     @property
     def surface(self) -> tuple[SurfaceProperty, ...]:
-        """Strength; with ``metal`` metalness and reflectance; with either kind of blur the blur; with ``indices`` the
-        offset of the refractive index.
+        """Strength, blur, reflectance and metalness of metals, and the offset of the refractive index from the run's.
+
+        The blur needs ``rough`` or ``metal``, reflectance and metalness need ``metal``, the offset needs ``indices``.
+        The native pass reads metalness behind the reflectance.
         """
         minimum = float(torch.logit(torch.tensor(RESET_STRENGTH, dtype=torch.float64)))
-        logistic = SurfaceProperty("strength", "strength_logits", 1, torch.sigmoid, torch.logit, slot="share")
         rows = [
-            replace(logistic, initial=self.first_strength, rate=self.strength_rate, reset_minimum=minimum)
+            SurfaceProperty(
+                "strength",
+                "strength_logits",
+                activation=torch.sigmoid,
+                inverse=torch.logit,
+                initial=self.first_strength,
+                rate=self.strength_rate,
+                reset_minimum=minimum,
+            )
         ]
-        if self.metal:
-            rows += [METALNESS, replace(REFLECTANCE, rate=self.metal_rate)]
         if self.blurs:
-            blur = replace(logistic, name="blur", parameter="roughness_logits", slot="blur")
-            rows.append(replace(blur, initial=self.first_roughness, rate=self.roughness_rate))
+            blur = SurfaceProperty(
+                "blur",
+                "roughness_logits",
+                activation=torch.sigmoid,
+                inverse=torch.logit,
+                initial=self.first_roughness,
+                rate=self.roughness_rate,
+                weight="" if self.rough else "metalness",
+            )
+            rows.append(blur)
+        if self.metal:
+            rows += [replace(_REFLECTANCE, rate=self.metal_rate), _METALNESS]
         if self.indices:
-            rows.append(INDEX)
-        return (*rows, *self.added_surface)
+            rows.append(_INDEX)
+        return tuple(rows)
 
     @property
     def blurs(self) -> bool:
@@ -132,7 +151,7 @@ class DeferredShading(ShadingModel):
 
     @property
     def parameters(self) -> Mapping[str, Parameter]:
-        """Those of the surface properties; with ``local`` harmonics of the mirrored direction."""
+        """Parameters of the surface properties; with ``local`` harmonics of the mirrored direction."""
         own = {**super().parameters}
         if self.local:
             own["local_dc"] = Parameter((3,), self.local_rate)
@@ -141,51 +160,43 @@ class DeferredShading(ShadingModel):
 
     @property
     def light_parameters(self) -> Mapping[str, Parameter]:
-        """``texels`` [6, R, R, 3]."""
+        """Raw ``texels`` [6, R, R, 3] of the environment."""
         side = self.environment_resolution
         return {"texels": Parameter((6, side, side, 3), self.environment_rate)}
 
     def initialize(
         self, colors: Tensor, far: Tensor, generator: torch.Generator
     ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-        """The surface everywhere the same, no light of the Gaussians' own, and uniform texels."""
+        """Return the same surface for all Gaussians, zero local light, and uniform random texels."""
         first, _ = super().initialize(colors, far, generator)
         uniform = torch.rand(self.light_parameters["texels"].shape, generator=generator) * 2 - 1
         return first, {"texels": uniform * self.environment_spread}
 
     @property
     def layers(self) -> tuple[str, ...]:
-        """All, ``metalness`` if there can be metals, ``roughness`` if there is some."""
+        """All layers; ``metalness`` only with ``metal``, ``roughness`` only if surfaces can be rough."""
         absent = {"metalness": not self.metal, "roughness": not self.blurs}
         return tuple(name for name in LAYERS if not absent.get(name))
 
     def radiance(self, texels: Tensor) -> Tensor:
-        """Radiance of raw texel values."""
+        """Return the radiance of raw texel values."""
         return (
             torch.sigmoid(texels) if self.blend == "lerp" else torch.exp(texels.clamp(max=MAXIMUM_LOG_LIGHT))
         )
 
     def raw_texels(self, radiance: Tensor) -> Tensor:
-        """The inverse of ``radiance``; "lerp" holds radiance below 1, "fresnel" below e^5."""
+        """Return the inverse of ``radiance``, which is below 1 for "lerp" and below e^5 for "fresnel"."""
         if self.blend == "lerp":
             return torch.logit(radiance.clamp(_NO_LIGHT, 1 - _NO_LIGHT))
         return torch.log(radiance.clamp(min=_NO_LIGHT)).clamp(max=MAXIMUM_LOG_LIGHT)
 
     @property
     def radiance_cubemap(self) -> RadianceCubemap | None:
-        """The texels."""
+        """Radiance of the texels."""
         return RadianceCubemap("texels", self.radiance, self.raw_texels, LOCAL_NOTE if self.local else "")
 
-    def far_light(self, texels: Tensor, directions: Tensor, level: Tensor | None) -> Tensor:
-        """Radiance [P, 3] from far away along directions [P, 3], read at mip levels [P]; None: not blurred."""
-        if self.blend == "lerp":
-            return self.radiance(cubemap_lookup(texels, directions))
-        if level is None:
-            return cubemap_lookup(self.radiance(texels), directions)
-        return mip_lookup(light_levels(self.radiance(texels)), directions, level)
-
     def light_levels(self, texels: Tensor, *, rough: bool) -> list[Tensor]:
-        """Radiance from a mirror's level to that of a roughness of 1, or the first alone; of "lerp" the raw texels."""
+        """Return mip levels of the radiance, for mirrors the first alone; for "lerp" the raw texels."""
         if self.blend == "lerp":
             return [texels]
         return light_levels(self.radiance(texels)) if rough else [self.radiance(texels)]
@@ -198,133 +209,131 @@ class DeferredShading(ShadingModel):
         cosine: Tensor,
         index: float | Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
-        """Specular and diffuse contributions [..., 3].
+        """Return specular and diffuse contributions [..., 3].
 
         Args:
             base: [..., 3]. strength: [..., 1] in [0, 1]. light: [..., 3] from the mirrored direction.
             cosine: [..., 1] of the angle between the ray and the normal, in [0, 1].
-            index: refractive index, a number or [..., 1]; None: the run's.
+            index: refractive index, a number or [..., 1]; None: the index of the run.
         """
         if self.blend == "lerp":
             return strength * light, (1 - strength) * base
         s, p = reflectances_from_cosine(cosine, self.refractive_index if index is None else index)
         return strength * (0.5 * (s + p)) * light, base
 
-    def channel_parameters(self, gaussians: Parameters) -> ChannelParameters | None:
-        """``color`` and ``strength``, with ``local`` the Gaussians' own light ``local``; behind them ``blur`` where
-        there is some, where Gaussians are metals ``metal`` [N, 4], where they have refractive indices of their own
-        ``index`` [N, 1], the offset from the run's, and the added surface properties.
-        """
-        further = {}
-        if (blur := self.blur(gaussians)) is not None:
-            further["blur"] = blur[:, None]
-        has_metal = self.has_metal(gaussians)
-        if has_metal:
-            metals = gaussians["metalness"].detach(), reflectance(gaussians["reflectance_logits"])
-            further["metal"] = metal_channels(*metals)
-        if self.has_indices(gaussians):
-            further["index"] = gaussians["index_offset"].detach()[:, None]
-        for row in self.added_surface:
-            further[row.name] = row.values(gaussians).reshape(-1, row.channels)
-        return ChannelParameters(
+    def channels(self, gaussians: Parameters, center: Tensor, degree: int) -> Channels:
+        """Return base color, ``strength``, with ``local`` the local light, and the other surface properties."""
+        others = (row for row in self.surface if row.name != "strength")
+        further = surface_channels(others, gaussians)
+        return Channels(
+            None,
             gaussians["strength_logits"],
             gaussians["local_dc"] if self.local else None,
             gaussians["local_rest"] if self.local else None,
-            gaussians["metalness"].detach() if has_metal else None,
+            gaussians["metalness"].detach() if "metalness" in further else None,
             further,
         )
 
-    def has_indices(self, gaussians: Parameters) -> bool:
-        """Whether any Gaussian has a refractive index other than the run's."""
-        return self.indices and any_nonzero(gaussians, "index_offset")
-
-    def has_metal(self, gaussians: Parameters) -> bool:
-        """Whether one of the Gaussians is a metal; without, everything is as if there could be none."""
-        return self.metal and any_nonzero(gaussians, "metalness")
-
-    def blur(self, gaussians: Parameters) -> Tensor | None:
-        """Return the share [N] of the mip levels by which each Gaussian blurs; None: all are mirrors."""
-        if self.rough:
-            return torch.sigmoid(gaussians["roughness_logits"])
-        if self.has_metal(gaussians):
-            return gaussians["metalness"].detach() * torch.sigmoid(gaussians["roughness_logits"])
-        return None
-
     def shade(self, splatted: GBuffer, light: Light, camera: Camera) -> dict[str, Any]:
-        """``final``, ``specular``, ``diffuse`` and ``reflection`` [H, W, 3], ``strength`` and ``roughness`` [H, W].
+        """Return ``final``, ``specular``, ``diffuse`` and ``reflection`` [H, W, 3], and ``strength`` [H, W].
 
-        With ``metal`` also ``metalness`` [H, W] and, where there is some, ``metal``. Where there are several refractive
-        indices, ``index`` [H, W]. Added surface properties by their names, [H, W] or [H, W, C], blended over alpha.
+        With blur also ``roughness`` [H, W]. With ``metal`` also ``metalness`` [H, W]; if a Gaussian is a metal,
+        ``metal`` and ``reflectance`` [H, W, 3]. With several refractive indices also ``index`` [H, W]. Surface
+        properties of derived classes have layers of their names, [H, W] or [H, W, C].
         """
+        layout = splatted.layout
         texels = light["texels"]
-        strength = splatted["strength"][..., 0]
-        index = None
-        if "index" in splatted.layout:
-            index = self.refractive_index + splatted["index"][..., 0].detach()
-        blur = blended_blur(splatted)
-        layers: dict[str, Any]
         if splatted.metal is None and fits(splatted.features, texels):
-            textures = self.light_levels(texels, rough=blur is not None)
-            arguments = reflect_arguments(
-                splatted, self.blend == "fresnel", self.local, self.refractive_index
+            layers = shade_native(
+                splatted,
+                self.light_levels(texels, rough="blur" in layout),
+                camera,
+                fresnel=self.blend == "fresnel",
+                local=self.local,
+                refractive_index=self.refractive_index,
             )
-            layers = shade_native(splatted, textures, camera, arguments)
         else:
-            local = splatted["local"] if self.local else None
-            level = None if blur is None else LEVELS * blur
-            layers = {
-                **reflect_reference(
-                    splatted["color"], splatted["normal"], strength, texels, camera, self, local, index, level
-                )
-            }
-            layers = self._with_metals(layers, splatted, camera)
-        layers["strength"] = strength
-        if index is not None:
-            layers["index"] = index
+            layers = self._shade_reference(splatted, texels, camera)
+        layers["strength"] = splatted["strength"][..., 0]
+        if "index" in layout:
+            layers["index"] = self._index(splatted)
         if self.blurs:
-            shown = torch.zeros_like(splatted.alpha) if blur is None else blur
-            layers["roughness"] = gltf_roughness(shown, self.environment_resolution)
+            blur = splatted.mean("blur") if "blur" in layout else torch.zeros_like(splatted.alpha)
+            layers["roughness"] = gltf_roughness(blur, self.environment_resolution)
         if self.metal:
             layers["metalness"] = metalness_picture(layers["metal"], splatted.features)
-        for row in self.added_surface:
-            blended = splatted[row.name] / splatted.alpha.detach().clamp(min=1e-6)[..., None]
-            layers[row.name] = blended[..., 0] if row.channels == 1 else blended
-        return layers
+        if "reflectance" in layout:
+            share = splatted["metalness"].detach().clamp(min=1e-3)
+            layers["reflectance"] = splatted["reflectance"].detach() / share
+        added = (row.name for row in self.surface if row.name not in _OWN)
+        return layers | {name: splatted.mean(name) for name in added}
 
-    def _with_metals(self, layers: dict[str, Any], splatted: GBuffer, camera: Camera) -> dict[str, Any]:
-        """The layers of dielectrics with the contribution of metals: the reference of ``shade_native``."""
+    def _index(self, splatted: GBuffer) -> Tensor:
+        """Return the refractive index [H, W] of each pixel."""
+        return self.refractive_index + splatted["index"][..., 0].detach()
+
+    def _shade_reference(self, splatted: GBuffer, texels: Tensor, camera: Camera) -> dict[str, Any]:
+        """Return the layers of ``shade_native``, computed by the reference implementations."""
+        layers = self.reflect(
+            splatted["color"],
+            splatted["normal"],
+            splatted["strength"][..., 0],
+            texels,
+            camera,
+            splatted["local"] if self.local else None,
+            self._index(splatted) if "index" in splatted.layout else None,
+            LEVELS * splatted.mean("blur") if "blur" in splatted.layout else None,
+        )
         metal = splatted.metal
-        if metal is None and "metal" in splatted.layout:
+        if metal is None and "reflectance" in splatted.layout:
             features = splatted.features
             rays = camera.world_rays(dtype=features.dtype, device=features.device)
             metal = metal_pixels(
                 features.flatten(0, 1),
-                splatted.layout,
+                splatted.layout["reflectance"].start,
                 rays.flatten(0, 1),
                 splatted["normal"].flatten(0, 1),
                 layers["reflection"].flatten(0, 1),
             )
         return {**(layers if metal is None else with_metal(layers, metal)), "metal": metal}
 
-    def colors(self, gaussians: Parameters, light: Light, rays: Tensor, normals: Tensor) -> Tensor:
-        """Colors [N, 3] of Gaussians by themselves; see ``ShadingModel``."""
-        directions = mirrored(rays, normals).contiguous()
-        blur = self.blur(gaussians)
-        reflected = self.far_light(light["texels"], directions, None if blur is None else LEVELS * blur)
-        if self.local:
-            reflected = (reflected + local_light(gaussians, directions, 3)).clamp(min=0)
-        cosine = -(rays * normals).sum(dim=-1, keepdim=True).clamp(-1, 0)
-        base = harmonic_colors(gaussians, rays)
-        strength = self.strength(gaussians)[:, None]
-        several = self.has_indices(gaussians)
-        index = self.refractive_index + gaussians["index_offset"][:, None] if several else None
-        specular, diffuse = self.contributions(base, strength, reflected, cosine, index)
-        if not self.has_metal(gaussians):
-            return specular + diffuse
-        mean, _ = optics.conductor(cosine, reflectance(gaussians["reflectance_logits"]))
-        return torch.lerp(specular + diffuse, mean * reflected, gaussians["metalness"][:, None])
+    def reflect(
+        self,
+        base: Tensor,
+        normal: Tensor,
+        strength: Tensor,
+        texels: Tensor,
+        camera: Camera,
+        local: Tensor | None = None,
+        index: Tensor | None = None,
+        level: Tensor | None = None,
+    ) -> dict[str, Tensor]:
+        """Shade dielectrics per pixel: the reference implementation of ``reflect_native``, any dtype and device.
 
-    def diffuse_colors(self, gaussians: Parameters, rays: Tensor) -> Tensor:
-        """Linear colors [N, 3] without reflections: none of metals."""
-        colors = super().diffuse_colors(gaussians, rays)
-        return colors * (1 - gaussians["metalness"][:, None]) if self.has_metal(gaussians) else colors
+        Args:
+            base: [H, W, 3]. normal: [H, W, 3] world, any length. strength: [H, W]. texels: [6, R, R, 3] raw.
+            camera: camera of the picture.
+            local: [H, W, 3] blended local light, added to the environment's.
+            index: [H, W] refractive index; None: the index of the run.
+            level: [H, W] mip level of the environment; None: all surfaces are mirrors.
+
+        Returns:
+            ``final``, ``specular``, ``diffuse`` and ``reflection``, each [H, W, 3].
+        """
+        rays = camera.world_rays(dtype=base.dtype, device=base.device)
+        facing = unit(normal, 1e-3)
+        directions = mirrored(rays, facing).reshape(-1, 3).contiguous()
+        textures = self.light_levels(texels, rough=level is not None)
+        if level is None or self.blend == "lerp":
+            light = cubemap_lookup(textures[0], directions)
+        else:
+            light = mip_lookup(textures, directions, level.flatten())
+        if self.blend == "lerp":
+            light = self.radiance(light)
+        light = light.reshape(base.shape)
+        if local is not None:
+            light = (light + local).clamp(min=0)
+        cosine = -dot(rays, facing)[..., None].clamp(-1, 0)
+        indices = None if index is None else index[..., None]
+        specular, diffuse = self.contributions(base, strength[..., None], light, cosine, indices)
+        return {"final": specular + diffuse, "specular": specular, "diffuse": diffuse, "reflection": light}

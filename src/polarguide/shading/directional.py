@@ -1,17 +1,19 @@
 """Directional factorization (Ref-GS, Zhang et al. 2025), deferred: light of a learned grid of feature vectors.
 
-One alpha blend splats albedo (3), normal (3), roughness (1) and a feature (4). Per pixel, with ``w`` the view ray
-mirrored at the blended normal and ``r`` the roughness,
+One alpha blend splats albedo (3), normal (3), roughness (1) and a feature (4). With ``w`` the view ray mirrored at the
+blended normal and ``r`` the roughness, a pixel has
 
-    h = grid(w, level = L r)                  16 values of a learned cubemap with L box-filtered levels
-    specular = exp(min(MLP(h, h x f), 5))     f the blended feature at unit length, h x f their outer product (64)
+    h = grid(w, level = L r)
+    specular = exp(min(MLP(h, h x f), 5))
     final = albedo + specular
 
-in linear radiance. The MLP has two hidden layers with ReLU. The albedo does not depend on the view.
+in linear radiance. The grid is a learned cubemap of 16 channels with L box-filtered levels, f the blended feature at
+unit length, and h x f an outer product of 64 values. The MLP has two hidden layers with ReLU. The albedo is independent
+of the view.
 
-Surroundings are no surface that reflects: a Gaussian that began farther away than the cameras (``surface`` 0) splats
-its harmonics in place of the albedo, and the specular light of a pixel counts by the share of its alpha that Gaussians
-with a surface have. (The release blends the two on real scenes by a sphere that the user gives.)
+Surroundings do not reflect. A Gaussian that started farther away than the cameras (``surface`` 0) splats its harmonics
+instead of the albedo. Specular light of a pixel is multiplied by the share of its alpha from Gaussians with a surface.
+(For real scenes the release separates both by a sphere that the user specifies.)
 """
 
 from __future__ import annotations
@@ -38,36 +40,39 @@ from polarguide.shading.model import (
     Parameters,
     ShadingModel,
     base_colors,
-    harmonic_colors,
     mirrored,
 )
 
 CHANNELS = 16
+"""Number of channels of the grid."""
 FEATURES = 4
+"""Number of features of a Gaussian."""
 INPUTS = CHANNELS * (1 + FEATURES)
-# Brightest albedo is e^5 / 5, about 30 times display white (the release's scale).
+"""Number of inputs of the MLP."""
 ALBEDO_SCALE = 0.2
-# Pixels with less alpha than this get no specular light: there is no surface to reflect it.
+"""Scale of the albedo as in the release; its maximum is e^5 / 5, about 30 times display white."""
 MINIMUM_ALPHA = 0.05
-_DARKEST = 1e-3  # a black point's first albedo, so that its logarithm is finite
+"""Alpha of a pixel below which it has no specular light."""
+_DARKEST = 1e-3
+"""First albedo of a black point, so that its logarithm is finite."""
 
 
 def albedo_of(gaussians: Parameters) -> Tensor:
-    """Albedo [N, 3], ``exp(min(x, 5)) / 5`` of the parameter ``log_albedo``."""
+    """Return the albedo [N, 3], ``exp(min(x, 5)) / 5`` of the parameter ``log_albedo``."""
     return ALBEDO_SCALE * gaussians["log_albedo"].clamp(max=MAXIMUM_LOG_LIGHT).exp()
 
 
 @dataclass(frozen=True)
 class DirectionalShading(ShadingModel):
-    """Light of a learned grid of feature vectors that a small network reads; see the module's text.
+    """Light of a learned grid of feature vectors that a small network reads; see the module.
 
     Attributes:
         width: width of the MLP's two hidden layers.
         mlp_rate: learning rate of the MLP.
-        albedo_rate: learning rate of the albedo. feature_rate: of roughness and features.
-        first_albedo: share of the first points' colors that albedo begins with, in (0, 1].
-        first_roughness: that Gaussians begin with, in (0, 1).
-        first_light: specular radiance before the first step (the MLP's output bias is its logarithm).
+        albedo_rate: learning rate of the albedo. feature_rate: learning rate of roughness and features.
+        first_albedo: first albedo as a share of the first points' colors, in (0, 1].
+        first_roughness: roughness before the first step, in (0, 1).
+        first_light: specular radiance before the first step; its logarithm is the output bias of the MLP.
         environment_spread: first texels of the grid are uniform in plus or minus this.
         environment_rate: learning rate of the texels.
         environment_resolution: texels along a cube face's side, a power of two.
@@ -88,7 +93,7 @@ class DirectionalShading(ShadingModel):
 
     @property
     def parameters(self) -> Mapping[str, Parameter]:
-        """``log_albedo`` [N, 3], ``roughness_logits`` [N], ``features`` [N, 4]; ``surface`` [N] keeps its 1 or 0."""
+        """``log_albedo`` [N, 3], ``roughness_logits`` [N], ``features`` [N, 4]; ``surface`` [N], 1 or 0, fixed."""
         return {
             "log_albedo": Parameter((3,), self.albedo_rate),
             "roughness_logits": Parameter((), self.feature_rate),
@@ -109,9 +114,9 @@ class DirectionalShading(ShadingModel):
     def initialize(
         self, colors: Tensor, far: Tensor, generator: torch.Generator
     ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-        """Albedo from the colors, one roughness, random features, and a surface where the position is not ``far``.
+        """Return albedo from the colors, one roughness, random features, and a surface unless a position is ``far``.
 
-        The light has uniform texels, and an MLP that is uniform within 1 / sqrt(inputs), as torch's Linear.
+        The light has uniform texels, and the MLP is uniform within 1 / sqrt(inputs) like ``torch.nn.Linear``.
         """
         count = colors.shape[0]
         albedo = (self.first_albedo * colors).clamp(min=_DARKEST)
@@ -136,13 +141,13 @@ class DirectionalShading(ShadingModel):
         return first, values
 
     def radiance(self, light: Light, directions: Tensor, roughness: Tensor, features: Tensor) -> Tensor:
-        """Specular radiance [P, 3], in (0, e^5].
+        """Return the specular radiance [P, 3], in (0, e^5].
 
         Args:
-            light: parameters as of ``light_parameters``.
+            light: the parameters in ``light_parameters``.
             directions: [P, 3] mirrored rays, of any length.
-            roughness: [P] in [0, 1]; from ``1 - 1 / L`` on, with L mip levels, it reads the mean of the grid.
-            features: [P, 4] of any length; zero reads the light without them.
+            roughness: [P] in [0, 1]; values of at least ``1 - 1 / L`` with L mip levels read the mean of the grid.
+            features: [P, 4] of any length; with zero length they have no effect.
         """
         levels = box_mips(light["texels"])
         looked_up = mip_lookup(levels, directions, len(levels) * roughness)
@@ -155,30 +160,26 @@ class DirectionalShading(ShadingModel):
         out = torch.addmm(light["mlp_bias_2"], hidden, light["mlp_weight_2"])
         return out.clamp(max=MAXIMUM_LOG_LIGHT).exp()
 
-    def channels(self, gaussians: Parameters, normals: Tensor, center: Tensor, degree: int) -> Channels:
-        """Albedo, or harmonics without a surface, as ``color`` [N, 3]; ``blur`` [N, 1], ``feature`` [N, 4] and
-        ``surface`` [N, 1].
+    def channels(self, gaussians: Parameters, center: Tensor, degree: int) -> Channels:
+        """Return albedo, or harmonics without a surface, as color; ``blur``, ``feature`` and ``surface``.
 
-        Without a surface the latter are 0.
+        Without a surface the latter three are 0.
         """
         surface = gaussians["surface"].detach()[:, None]
         colors = torch.where(surface > 0, albedo_of(gaussians), base_colors(gaussians, center, degree))
-        blur = torch.sigmoid(gaussians["roughness_logits"])[:, None]
-        feature = torch.tanh(gaussians["features"])
-        return {
-            "color": colors,
-            "blur": surface * blur,
-            "feature": surface * feature,
+        further = {
+            "blur": surface * torch.sigmoid(gaussians["roughness_logits"])[:, None],
+            "feature": surface * torch.tanh(gaussians["features"]),
             "surface": surface,
         }
+        return Channels(colors, further=further)
 
     def shade(self, splatted: GBuffer, light: Light, camera: Camera) -> dict[str, Tensor]:
-        """``final``, ``specular`` and ``diffuse`` [H, W, 3]; the color that was splatted is the diffuse one."""
+        """Return ``final``, ``specular`` and ``diffuse`` [H, W, 3]; the splatted color is the diffuse layer."""
         albedo = splatted["color"]
-        normal = splatted["normal"]
         alpha = splatted.alpha
         rays = camera.world_rays(dtype=albedo.dtype, device=albedo.device)
-        directions = mirrored(rays, unit(normal, 1e-3))
+        directions = mirrored(rays, unit(splatted["normal"], 1e-3))
         radiance = self.radiance(
             light,
             directions.reshape(-1, 3),
@@ -188,19 +189,3 @@ class DirectionalShading(ShadingModel):
         share = (splatted["surface"][..., 0] / alpha.clamp(min=MINIMUM_ALPHA)).clamp(max=1)
         specular = radiance * (share * (alpha > MINIMUM_ALPHA))[..., None]
         return {"final": albedo + specular, "specular": specular, "diffuse": albedo}
-
-    def colors(self, gaussians: Parameters, light: Light, rays: Tensor, normals: Tensor) -> Tensor:
-        """Each Gaussian shaded alone, at its own normal, roughness and feature: linear colors [N, 3].
-
-        Args:
-            rays: [N, 3] unit. normals: [N, 3] unit, facing them.
-        """
-        roughness = torch.sigmoid(gaussians["roughness_logits"])
-        features = torch.tanh(gaussians["features"])
-        specular = self.radiance(light, mirrored(rays, normals), roughness, features)
-        return self.diffuse_colors(gaussians, rays) + gaussians["surface"][:, None] * specular
-
-    def diffuse_colors(self, gaussians: Parameters, rays: Tensor) -> Tensor:
-        """Albedo, or harmonics without a surface [N, 3]."""
-        surface = gaussians["surface"][:, None] > 0
-        return torch.where(surface, albedo_of(gaussians), harmonic_colors(gaussians, rays))

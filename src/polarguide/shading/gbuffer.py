@@ -1,12 +1,11 @@
-"""From Gaussians to a picture: features of the Gaussians, one splat of the G-buffer, then the shading model per pixel.
+"""Rendering: features of the Gaussians, one splat of the G-buffer, then the shading model per pixel.
 
-On the CPU in float32 one native pass each way does what a shading model describes with ``ChannelParameters``;
-``splatting_reference`` asks it for its ``channels``.
+On the CPU in float32 one native pass in each direction computes the features of Gaussians from ``Channels``; other
+tensors use plain torch.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -17,6 +16,7 @@ from torch.autograd.function import once_differentiable
 
 from polarguide import _native
 from polarguide.core.native import applied, fits
+from polarguide.gaussians.gaussians import CORE_SHAPES
 from polarguide.gaussians.geometry import GRAZING, shortest_axis_normals
 from polarguide.geometry.camera import Camera
 from polarguide.raster.interface import Rasterize, ScreenStatistic, Splats
@@ -24,11 +24,11 @@ from polarguide.raster.magnification import as_trained
 from polarguide.raster.surface import surface_picture
 from polarguide.shading.model import PLAIN, GBuffer, Light, Parameters, ShadingModel
 from polarguide.shading.native import DETACHED, split_native
-from polarguide.shading.result import NORMAL_CHANNELS, Layout, RenderResult
+from polarguide.shading.result import NORMAL_CHANNELS, ChannelSlices, RenderResult, channel_slices
 
 
 def splats(gaussians: Parameters, features: Tensor | None = None) -> Splats:
-    """Gaussians as a rasterizer takes them, with features [N, D]; none: one that is zero."""
+    """Return the input of a rasterizer, with features [N, D]; by default one feature that is zero."""
     means = gaussians["means"]
     return Splats(
         means,
@@ -47,65 +47,45 @@ def splatting(
     sh_degree: int,
     normals: bool,
     depth: bool,
-) -> tuple[Splats, Layout]:
-    """Gaussians as a rasterizer takes them, with what a shading model splats, and which feature is what.
+    native: bool = True,
+) -> tuple[Splats, ChannelSlices]:
+    """Return the input of a rasterizer for a shading model, and the features by name.
 
-    Features are its color [N, 3], with ``normals`` unit normals (``shortest_axis_normals``) in world axes [N, 3], its
-    further channels, and with ``depth`` the camera depth [N, 1] at last.
+    Features are the color [N, 3], with ``normals`` unit normals (``shortest_axis_normals``) in world axes [N, 3],
+    further channels of the model, and with ``depth`` the camera depth [N, 1].
 
     Args:
-        gaussians: with the parameters of the shading model; with ``outward`` where normals are turned to the side from
-            which they are seen. sh_degree: degree of the base color's harmonics, 0 to 3.
+        gaussians: Gaussians with the parameters of the shading model; with ``outward`` if normals point to the side of
+            the cameras that see them.
+        camera: the view. shading: the shading model.
+        sh_degree: degree of the base color's harmonics, 0 to 3. normals, depth: whether to splat these features.
+        native: False: the reference implementation in plain torch, any dtype and device.
 
     Returns:
-        Differentiable in the Gaussians; the same bits for any number of threads.
+        Differentiable in the Gaussians. The number of threads does not change a bit.
 
     Raises:
-        ValueError: the degree, or a shape, is not as above.
+        ValueError: the degree or a shape does not fit.
     """
-    described = shading.channel_parameters(gaussians)
     core = [gaussians[name] for name in _CORE]
-    outward = gaussians.get("outward") if normals else None
-    if described is None or not fits(*core, outward, *described[:-1], *described.further.values()):
-        return splatting_reference(
-            gaussians, camera, shading, sh_degree=sh_degree, normals=normals, depth=depth
-        )
-    pose = camera.pose(torch.float32, core[0].device)
-    forward = pose.rotation[2].contiguous() if depth else None
-    settings = SplattingSettings(sh_degree, pose.center.contiguous(), forward, normals)
-    further = torch.cat([*described.further.values()], dim=1) if described.further else None
-    tensors = applied(_Splatting, settings, *core, outward, *described[:-1], further)
-    return Splats(*tensors), Layout(_widths(described.widths, normals=normals, depth=depth))
-
-
-def splatting_reference(
-    gaussians: Parameters,
-    camera: Camera,
-    shading: ShadingModel,
-    *,
-    sh_degree: int,
-    normals: bool,
-    depth: bool,
-) -> tuple[Splats, Layout]:
-    """The reference implementation of ``splatting``: plain torch around the model's channels, any dtype and device."""
-    means = gaussians["means"]
+    means, quaternions, log_scales = core[:3]
     pose = camera.pose(means.dtype, means.device)
+    outward = gaussians.get("outward") if normals else None
+    own = shading.channels(gaussians, pose.center, sh_degree)
+    widths = {"color": 3} | ({"normal": 3} if normals else {}) | own.widths | ({"depth": 1} if depth else {})
+    layout = channel_slices(widths)
+    if native and own.color is None and fits(*core, outward, *own[:-1], *own.further.values()):
+        forward = pose.rotation[2].contiguous() if depth else None
+        settings = SplattingSettings(sh_degree, pose.center.contiguous(), forward, normals)
+        further = torch.cat([*own.further.values()], dim=1) if own.further else None
+        tensors = applied(_Splatting, settings, *core, outward, *own[1:-1], further)
+        return Splats(*tensors), layout
+    axes = means.new_empty(len(means), 0)
     if normals:
-        shape = means, gaussians["quaternions"], gaussians["log_scales"]
-        axes = shortest_axis_normals(*shape, pose.center, gaussians.get("outward"))
-    else:
-        axes = means.new_empty(len(means), 0)
-    own = shading.channels(gaussians, axes, pose.center, sh_degree)
-    widths = _widths({name: t.shape[1] for name, t in own.items()}, normals=normals, depth=depth)
-    own |= {"normal": axes, "depth": ((means - pose.center) @ pose.rotation[2])[:, None]}
-    return splats(gaussians, torch.cat([own[name] for name in widths], dim=1)), Layout(widths)
-
-
-def _widths(own: Mapping[str, int], *, normals: bool, depth: bool) -> dict[str, int]:
-    """Numbers of all channels, given those of the shading model, which begin with the color."""
-    first = {"color": 3, **({"normal": 3} if normals else {})}
-    last = {"depth": 1} if depth else {}
-    return {**first, **{name: width for name, width in own.items() if name != "color"}, **last}
+        axes = shortest_axis_normals(means, quaternions, log_scales, pose.center, outward)
+    values = own.values(gaussians, axes, pose.center, sh_degree)
+    values |= {"normal": axes, "depth": ((means - pose.center) @ pose.rotation[2])[:, None]}
+    return splats(gaussians, torch.cat([values[name] for name in widths], dim=1)), layout
 
 
 _CORE = ("means", "quaternions", "log_scales", "opacity_logits", "sh_dc", "sh_rest")
@@ -125,10 +105,11 @@ _INPUTS = (
 )
 """Tensors of the native pass by the names of its arguments, in the order of ``_Splatting``."""
 _UNTRAINED = ("outward", "metalness")
+"""Tensors of the native pass without a gradient."""
 
 
 class SplattingSettings(NamedTuple):
-    """Arguments of the native pass that are no parameters of Gaussians.
+    """Arguments of the native pass other than the parameters of Gaussians.
 
     Attributes:
         degree: degree of the base color's harmonics. center: [3] of the camera.
@@ -182,22 +163,23 @@ class _Splatting(torch.autograd.Function):
 
 
 NO_LIGHT: Light = MappingProxyType({})
+"""Light of a model without parameters of the light."""
 
 
 @dataclass(frozen=True, eq=False)
 class RenderRequest:
-    """The layers that a rendering has to have.
+    """Layers requested from a rendering.
 
     Attributes:
         sh_degree: SH degree of the base color, 0 to 3.
-        normals: the blended normal, also for a shading model that does not need it.
+        normals: the blended normal; a shading model that reflects always has it.
         depth: the camera depth.
-        layers_detached: the layers once more, without a gradient on the normals (of a shading model with layers).
-        normal_rotation_only: the blended normal once more, with a gradient that rotates Gaussians, but neither moves
-            them nor changes their opacity.
-        at_median_depth: normal and depth are those of the surface at each pixel's median depth, without gradients. The
-            layers are shaded with the blended normal all the same.
-        statistic: see ``ScreenStatistic``; the color channels come first.
+        layers_detached: a second copy of the layers, without a gradient on the normals.
+        normal_rotation_only: a second copy of the blended normal. Its gradient rotates Gaussians and leaves
+            their position and opacity unchanged.
+        at_median_depth: normal and depth describe the surface at each pixel's median depth, without gradients. Shading
+            still uses the blended normal.
+        statistic: see ``ScreenStatistic``.
     """
 
     sh_degree: int = 3
@@ -222,14 +204,15 @@ def render(
     """Render one view.
 
     Args:
-        gaussians: the Gaussians, with the parameters of the shading model; with ``outward`` where normals are turned
-            to the side from which they are seen, not to the camera.
-        request: what the result holds.
-        shading: what is splatted, and how it makes the picture. light: its learned light, by name.
-        footprints: [N] of the training, with which larger pictures are as smooth as it was, see
-            ``raster.magnification``; None: drawn as they are, which is how training draws.
+        gaussians: Gaussians with the parameters of the shading model; with ``outward`` if normals point to the side of
+            the cameras that see them instead of the camera of the view.
+        camera: the view. rasterize: rasterizer of the backend.
+        request: requested layers.
+        shading: the shading model. light: its learned light by name.
+        footprints: [N] pixel sizes of the training, which keep larger pictures smooth, see ``raster.magnification``;
+            None: Gaussians are drawn without additional blur, as in a training.
     """
-    normals = request.normals or shading.needs_normals
+    normals = request.normals or shading.reflects
     depth = request.depth
     gaussian_splats, layout = splatting(
         gaussians, camera, shading, sh_degree=request.sh_degree, normals=normals, depth=depth
@@ -247,7 +230,7 @@ def render(
     layers |= {"base": splatted["color"], "alpha": picture.alpha}
     if request.at_median_depth and (normals or depth):
         directions = (
-            gaussian_splats.features[:, layout.channels("normal")]
+            gaussian_splats.features[:, layout["normal"]]
             if normals
             else torch.zeros_like(gaussian_splats.means)
         )
@@ -270,8 +253,8 @@ def shaded(
 ) -> dict[str, Any]:
     """Return the layers of a shading model, and the ``DETACHED`` ones if the G-buffer requests them.
 
-    Where the model does not return these, or not ``native``, it shades a second time with detached normals. Metals keep
-    their gradient on the normals.
+    If the model does not return these or ``native`` is False, it shades a second time with detached normals. Metals
+    keep their gradient on the normals.
     """
     layers = {**shading.shade(replace(splatted, detached=splatted.detached and native), light, camera)}
     if not splatted.detached or "specular" not in layers or DETACHED[0] in layers:
@@ -285,10 +268,10 @@ def shaded(
 Split = tuple[Tensor, Tensor | None, Tensor | None]
 
 
-def split(features: Tensor, alpha: Tensor, layout: Layout) -> Split:
-    """The layers of a G-buffer: ``split_reference``, on the CPU in float32 with one native gradient pass.
+def split(features: Tensor, alpha: Tensor, layout: ChannelSlices) -> Split:
+    """Split normal and depth from a G-buffer; ``split_reference`` or, on the CPU in float32, a native pass.
 
-    Without a gradient and a depth there is nothing to do natively: the normal is a part of the features.
+    Without a gradient and a depth a slice of the features suffices.
     """
     depth = "depth" in layout
     further = features.shape[-1] > 6
@@ -297,13 +280,64 @@ def split(features: Tensor, alpha: Tensor, layout: Layout) -> Split:
     return split_reference(features, alpha, layout)
 
 
-def split_reference(features: Tensor, alpha: Tensor, layout: Layout) -> Split:
-    """Features for the shading model, blended normal [H, W, 3] and camera depth [H, W]; any dtype and device.
+def split_reference(features: Tensor, alpha: Tensor, layout: ChannelSlices) -> Split:
+    """Return features for the shading model, blended normal [H, W, 3] and camera depth [H, W]; any dtype and device.
 
     Args:
-        features: [H, W, D] blended; the depth is times alpha. alpha: [H, W]. layout: layout of the features.
+        features: [H, W, D] blended; the depth is multiplied by alpha. alpha: [H, W]. layout: features by name.
     """
-    normal = features[..., layout.channels("normal")] if "normal" in layout else None
+    normal = features[..., layout["normal"]] if "normal" in layout else None
     if "depth" not in layout:
         return features, normal, None
-    return features, normal, features[..., layout.first("depth")] / alpha.clamp(min=1e-6)
+    return features, normal, features[..., layout["depth"].start] / alpha.clamp(min=1e-6)
+
+
+class _RayCamera(Camera):
+    """Camera whose picture is one column of pixels with given rays."""
+
+    def __init__(self, rays: Tensor) -> None:
+        rotation = torch.eye(3, dtype=torch.float64)
+        super().__init__(1, len(rays), 1.0, 1.0, 0.0, 0.0, rotation, torch.zeros(3, dtype=torch.float64))
+        self.__dict__["_rays"] = rays[:, None]
+
+    def rays(self, *, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu") -> Tensor:
+        """Return the rays [N, 1, 3]."""
+        rays: Tensor = self.__dict__["_rays"]
+        return rays.to(device, dtype)
+
+
+def _values_along(
+    gaussians: Parameters, shading: ShadingModel, rays: Tensor, normals: Tensor
+) -> dict[str, Tensor]:
+    """Return the channels of Gaussians by name, each seen along its own ray: from the origin, with its ray as mean."""
+    names = (*CORE_SHAPES, *shading.parameters)
+    tensors = {name: values for name in names if (values := gaussians.get(name)) is not None}
+    tensors["means"] = rays
+    origin = rays.new_zeros(3)
+    return {**shading.channels(tensors, origin, 3).values(tensors, normals, origin, 3), "normal": normals}
+
+
+def single_colors(
+    gaussians: Parameters, light: Light, shading: ShadingModel, rays: Tensor, normals: Tensor
+) -> Tensor:
+    """Shade Gaussians one by one.
+
+    Args:
+        gaussians, light, shading: the Gaussians, the light and the shading model.
+        rays: [N, 3] unit. normals: [N, 3] unit, facing the rays.
+
+    Returns:
+        [N, 3] linear colors.
+    """
+    values = _values_along(gaussians, shading, rays, normals)
+    order = ("color", "normal", *(name for name in values if name not in ("color", "normal")))
+    features = torch.cat([values[name] for name in order], dim=1)[:, None]
+    layout = channel_slices({name: values[name].shape[1] for name in order})
+    splatted = GBuffer(features, torch.ones_like(features[..., 0]), layout)
+    final: Tensor = shading.shade(splatted, light, _RayCamera(rays))["final"]
+    return final[:, 0]
+
+
+def diffuse_colors(gaussians: Parameters, shading: ShadingModel, rays: Tensor) -> Tensor:
+    """Return linear colors [N, 3] of Gaussians without reflections, along unit rays [N, 3]."""
+    return _values_along(gaussians, shading, rays, -rays)["color"]

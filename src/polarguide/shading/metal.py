@@ -1,19 +1,19 @@
-"""Metals beside dielectrics in the deferred shading model.
+"""Metals in the deferred shading model.
 
-A Gaussian is a metal or a dielectric (``metalness`` 1 or 0, decided by ``training.metals`` or by masks, never learned);
-before the last decision it can be a mixture of both.
-A metal has no diffuse reflection: its base color and its strength do not count. What it reflects is
+A Gaussian has a ``metalness`` of 1 (metal) or 0 (dielectric). ``training.metals`` or masks decide it; it is never
+learned. Before the last decision it can be a mixture of both. A metal has no diffuse reflection: its base color and
+its strength do not count. Its reflection is
 
     specular = R(r, i) L
 
-with R of a conductor (``optics.conductor``) of reflectance r at normal incidence per color, and L the light that a
-dielectric would mirror there, too. Blended are ``metalness``, and reflectance times ``metalness``; a pixel that metals
-share with others adds both.
+with R of a conductor (``optics.conductor``) of reflectance r at normal incidence per color, and L the same mirrored
+light as for a dielectric. ``metalness`` and the reflectance times ``metalness`` are blended. A pixel that metals share
+with dielectrics is the sum of both.
 
-``convert`` makes Gaussians metals, or dielectrics again. What a dielectric's base color showed from a direction, a
-metal mirrors from the direction that belongs to it at the Gaussian's normal. Mirroring maps harmonics of a degree onto
-themselves, so that the base color over the reflectance becomes light of the Gaussian's own exactly; less the
-environment's, as far as harmonics can tell it.
+``convert`` turns Gaussians into metals or back into dielectrics. ``mirror_base`` then gives a new metal local light
+that shows the previous base color in each direction. Mirroring at the Gaussian's normal maps harmonics of a degree onto
+themselves, so the base color over the reflectance becomes local light exactly. The environment's light is subtracted,
+up to the degree of the harmonics.
 """
 
 from __future__ import annotations
@@ -33,52 +33,49 @@ from polarguide.geometry.camera import Camera
 from polarguide.geometry.vectors import dot, spread_directions, unit
 from polarguide.optics.fresnel import LARGEST_REFLECTANCE
 from polarguide.shading.cubemap import cubemap_lookup
-from polarguide.shading.result import Layout, MetalPixels
+from polarguide.shading.result import MetalPixels, RenderResult
 
-# Of which a metal's reflectance is trained between these.
 LEAST = 0.2
+"""Lower bound of a metal's reflectance."""
 FIRST_REFLECTANCE = 0.7
-# Pixels with less of a metal than this are shaded as dielectrics alone.
+"""Reflectance of metals before the first step."""
 MINIMUM_SHARE = 0.01
+"""Metalness of a pixel below which it is shaded as a dielectric."""
 
 
 def reflectance(logits: Tensor) -> Tensor:
-    """Reflectance at normal incidence of its parameter, within what metals have."""
+    """Return the reflectance at normal incidence of its parameter, within the range of metals."""
     return LEAST + (LARGEST_REFLECTANCE - LEAST) * torch.sigmoid(logits)
 
 
 def reflectance_logits(values: Tensor) -> Tensor:
-    """The inverse of ``reflectance``; values beyond its range, and the ends themselves, come a little inside."""
+    """Return the inverse of ``reflectance``; values outside its range or at its ends are clamped to just inside."""
     return torch.logit(((values - LEAST) / (LARGEST_REFLECTANCE - LEAST)).clamp(0.02, 0.98))
 
 
-def metal_channels(metalness: Tensor, reflectances: Tensor) -> Tensor:
-    """Blended channels of metals, [N, 4]: reflectance times metalness, and metalness."""
-    m = metalness[:, None]
-    return torch.cat((m * reflectances, m), dim=1)
-
-
 def where_metal(features: Tensor, first: int) -> Tensor:
-    """Pixels [K] that show metal, ascending, of ``metal_pixels``' features."""
+    """Return the indices [K] of pixels that show metal, ascending.
+
+    Args:
+        features: [P, C] blended. first: first of four channels, reflectance times metalness and metalness.
+    """
     return (features[:, first + 3].detach() > MINIMUM_SHARE).nonzero()[:, 0]
 
 
-def metal_pixels(
-    features: Tensor, layout: Layout, rays: Tensor, normal: Tensor, light: Tensor
-) -> MetalPixels:
-    """Shade what shows metal: the reference implementation of what ``reflect_native`` does of metals.
+def metal_pixels(features: Tensor, first: int, rays: Tensor, normal: Tensor, light: Tensor) -> MetalPixels:
+    """Shade the pixels that show metal: the reference implementation of metals in ``reflect_native``.
 
     Args:
-        features: [P, C] blended. layout: layout of its channels: ``metal`` as of ``metal_channels``.
+        features: [P, C] blended. first: first channel of metals, see ``where_metal``.
         rays: [P, 3] unit, world. normal: [P, 3] blended, world.
-        light: [P, 3] that is mirrored.
+        light: [P, 3] mirrored light.
     """
-    pixels = where_metal(features, layout.first("metal"))
-    # All channels at once: each part taken by itself would send back a picture of all of them.
+    pixels = where_metal(features, first)
+    # Gather all channels at once: the gradient of each gather is a whole picture.
     metal = features[pixels]
     rays = rays[pixels]
     facing = unit(normal[pixels], 1e-3)
-    metal = metal[:, layout.channels("metal")]
+    metal = metal[:, first : first + 4]
     share = metal[:, 3]
     inverse = 1 / share.clamp(min=MINIMUM_SHARE)
     mean, slope = optics.conductor(-dot(rays, facing)[:, None], metal[:, :3] * inverse[:, None])
@@ -86,57 +83,61 @@ def metal_pixels(
 
 
 def with_metal(layers: Mapping[str, Any], metal: MetalPixels) -> dict[str, Any]:
-    """Layers of a picture [H, W, 3] and what metals add to them."""
-    return {**layers, **{name: add_metal(layers[name], metal) for name in ("final", "specular")}}
-
-
-def add_metal(layer: Tensor, metal: MetalPixels) -> Tensor:
-    """A picture [H, W, 3] and what metals reflect in it."""
-    return layer.flatten(0, 1).index_add(0, metal.pixels, metal.specular).view_as(layer)
+    """Return layers [H, W, 3] of a picture with the contribution of metals."""
+    sums = {
+        name: layers[name].flatten(0, 1).index_add(0, metal.pixels, metal.specular).view_as(layers[name])
+        for name in ("final", "specular")
+    }
+    return {**layers, **sums}
 
 
 def metalness_picture(metal: MetalPixels | None, like: Tensor) -> Tensor:
-    """Blended metalness [H, W] of a picture with as many pixels as ``like`` [H, W, ...] has."""
+    """Return the blended metalness [H, W] of a picture of the size of ``like`` [H, W, ...]."""
     empty = like.new_zeros(like.shape[0] * like.shape[1])
     if metal is not None:
         empty = empty.index_copy(0, metal.pixels, metal.share.detach())
     return empty.view(like.shape[:2])
 
 
-def metal_stokes(
-    specular: Tensor,
-    diffuse: Tensor,
-    normal: Tensor,
-    metal: MetalPixels,
-    camera: Camera,
-    refractive_index: float | Tensor,
-) -> Tensor:
-    """Stokes vectors [3, K, 3] of the pixels that show metal, from layers on the scale of S0/2.
+def layer_stokes(result: RenderResult, camera: Camera, refractive_index: float) -> Tensor:
+    """Predict Stokes vectors [3, H, W, 3] of a picture of smooth dielectrics and metals.
 
-    What metals reflect has their degree of polarization, the rest that of a dielectric's lobes.
+    Light from metals has their degree of polarization, other light the degree of a dielectric's lobes.
 
     Args:
-        specular, diffuse, normal: [H, W, 3]. metal: with what it adds to ``specular``.
-        refractive_index: refractive index of the rest, a number or [K].
+        result: picture with the specular and diffuse layers and the normal. camera: camera of the picture.
+        refractive_index: refractive index of the run, for pictures without an ``index``.
     """
-    at = metal.pixels
-    rays = camera.rays(device=normal.device).flatten(0, 1)[at]
-    facing = unit(camera.to_camera(normal).flatten(0, 1)[at])
-    over = specular.flatten(0, 1)[at]
+    normal = result.shaded_normal
+    facing = camera.to_camera(normal)
+    rays = camera.rays(device=normal.device)
+    index = result.layers.get("index", refractive_index)
+    specular = result.layers["specular"]
+    diffuse = result.layers["diffuse"]
+    stokes = optics.predicted_stokes(2 * specular, 2 * diffuse, facing, rays, index)
+    if result.metal is None:
+        return stokes
+    at = result.metal.pixels
+    facing = unit(facing.flatten(0, 1)[at])
+    rays = rays.flatten(0, 1)[at]
+    others = specular.flatten(0, 1)[at] - result.metal.specular
     under = diffuse.flatten(0, 1)[at]
-    stokes = optics.predicted_stokes(2 * (over - metal.specular), 2 * under, facing, rays, refractive_index)
+    index = index.flatten()[at] if isinstance(index, Tensor) else index
+    metal = optics.predicted_stokes(2 * others, 2 * under, facing, rays, index)
     x_ref, up_ref = optics.lens_frame(rays)
     x = dot(facing, x_ref)[:, None]
     y = dot(facing, up_ref)[:, None]
-    polarized = 2 * metal.slope * metal.specular
-    added = torch.stack((2 * metal.specular, -polarized * (x * x - y * y), -polarized * (2 * x * y)))
-    return stokes + added
+    polarized = 2 * result.metal.slope * result.metal.specular
+    added = torch.stack((2 * result.metal.specular, -polarized * (x * x - y * y), -polarized * (2 * x * y)))
+    return stokes.flatten(1, 2).index_copy(1, at, metal + added).view_as(stokes)
 
 
 MOST_STRENGTH = 0.98
-# Directions in which functions are compared, and Gaussians at a time.
+"""Upper bound of strengths after the light became brighter."""
 DIRECTIONS = 128
+"""Number of directions in which base color and mirrored light are compared."""
 CHUNK = 4096
+"""Number of Gaussians per batch of that comparison."""
 
 
 def become_metal(
@@ -150,9 +151,10 @@ def become_metal(
     """Change which Gaussians are metals.
 
     Args:
-        texels: [6, R, R, 3] raw light from afar, changed in place. radiance: radiance of raw values.
+        gaussians: the Gaussians, changed in place.
+        texels: [6, R, R, 3] raw light from afar, changed in place. radiance: function from raw values to radiance.
         metalness: [N], 0 to 1. reflectances: [N, 3] at normal incidence, first values of new metals.
-        gain: factor by which all light should be brighter, called when the first metals appear.
+        gain: function that returns a factor on all light; called when the first metals appear.
     """
     first = not any_nonzero(gaussians, "metalness")
     fresh = convert(gaussians, metalness, reflectances)
@@ -166,43 +168,47 @@ def become_metal(
 
 @torch.no_grad()
 def convert(gaussians: Gaussians, metalness: Tensor, reflectances: Tensor) -> Tensor:
-    """Set the metalness of Gaussians. What begins or ends to be a metal has no light of its own at first; what is a
-    dielectric again has the base color and the strength that it had before. Nothing else is changed.
+    """Set the metalness of Gaussians.
+
+    Converted Gaussians start with zero local light. Base color and strength are unchanged, so a metal that becomes a
+    dielectric again has its previous ones.
 
     Args:
-        metalness: [N], 0 to 1. reflectances: [N, 3] at normal incidence, of new ones.
+        gaussians: the Gaussians, changed in place.
+        metalness: [N], 0 to 1. reflectances: [N, 3] at normal incidence, for new metals.
 
     Returns:
-        [N] bool, the new ones.
+        [N] bool, the new metals.
     """
     changed = (metalness > 0) != (gaussians["metalness"] > 0)
     fresh = (metalness > 0) & changed
     gaussians.overwrite("metalness", metalness)
     gaussians.overwrite("reflectance_logits", reflectance_logits(reflectances), fresh)
-    for name, own in _local(gaussians):
+    for name, own in _local_light(gaussians):
         gaussians.overwrite(name, torch.zeros_like(own), changed)
     return fresh
 
 
-def _local(gaussians: Gaussians) -> list[tuple[str, Tensor]]:
-    """Names and values of the light of their own, if they have some."""
+def _local_light(gaussians: Gaussians) -> list[tuple[str, Tensor]]:
+    """Return names and values of the harmonics of local light, if the Gaussians have such light."""
     tensors = ((name, gaussians.get(name)) for name in ("local_dc", "local_rest"))
     return [(name, own) for name, own in tensors if own is not None]
 
 
 @torch.no_grad()
 def scale_light(gaussians: Gaussians, texels: Tensor, gain: float) -> None:
-    """Make all light brighter, and strengths as much smaller, with Adam's moments of both at zero; 1 changes nothing.
+    """Multiply all light by ``gain`` and divide the strengths by it; Adam's moments of the Gaussians become zero.
 
     Args:
-        texels: logarithms, changed in place.
+        gaussians: the Gaussians, changed in place.
+        texels: logarithms of radiance, changed in place. gain: factor; 1 changes nothing.
     """
     if gain == 1:
         return
     texels.add_(math.log(gain))
     strength = (torch.sigmoid(gaussians["strength_logits"]) / gain).clamp(max=MOST_STRENGTH)
     gaussians.overwrite("strength_logits", torch.logit(strength))
-    for name, own in _local(gaussians):
+    for name, own in _local_light(gaussians):
         gaussians.overwrite(name, gain * own)
 
 
@@ -210,10 +216,11 @@ def scale_light(gaussians: Gaussians, texels: Tensor, gain: float) -> None:
 def mirror_base(
     gaussians: Gaussians, texels: Tensor, fresh: Tensor, radiance: Callable[[Tensor], Tensor]
 ) -> None:
-    """Give new metals the light of their own that makes them look as before; see the module's text.
+    """Give new metals the local light that leaves their look unchanged; see the module.
 
     Args:
-        texels: [6, R, R, 3] raw. fresh: [N] bool. radiance: of raw values.
+        gaussians: the Gaussians, changed in place.
+        texels: [6, R, R, 3] raw. fresh: [N] bool, the new metals. radiance: function from raw values to radiance.
     """
     means = gaussians["means"]
     toward = spread_directions(DIRECTIONS).to(means)
@@ -226,9 +233,9 @@ def mirror_base(
     originals = [gaussians[name].clone() for name in ("local_dc", "local_rest")]
     for chosen in fresh.nonzero()[:, 0].split(CHUNK):
         normals = axes[chosen]
-        seen_along = toward - 2 * (normals @ toward.T)[..., None] * normals[:, None]
+        directions = toward - 2 * (normals @ toward.T)[..., None] * normals[:, None]
         coefficients = torch.cat((gaussians["sh_dc"][chosen][:, None], gaussians["sh_rest"][chosen]), dim=1)
-        base = sh_basis(seen_along, 3) @ coefficients + 0.5
+        base = sh_basis(directions, 3) @ coefficients + 0.5
         target = base / reflectance(gaussians["reflectance_logits"][chosen])[:, None] - far
         local = solve @ target
         originals[0][chosen], originals[1][chosen] = local[:, 0], local[:, 1:]

@@ -1,13 +1,13 @@
 """Native passes over the G-buffer on the CPU.
 
-The reference implementation of ``reflect_native`` is ``reflect_reference``, of metals ``metal.metal_pixels``;
-that of ``split_native`` is ``gbuffer.split_reference``.
+Reference implementations: ``DeferredShading.reflect`` and ``metal.metal_pixels`` of ``reflect_native``,
+``gbuffer.split_reference`` of ``split_native``.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -16,11 +16,10 @@ from torch.autograd.function import once_differentiable
 from polarguide import _native
 from polarguide.core.native import applied
 from polarguide.geometry.camera import Camera
-from polarguide.geometry.vectors import dot, unit
 from polarguide.shading.cubemap import mips_backward
 from polarguide.shading.metal import MINIMUM_SHARE, where_metal
-from polarguide.shading.model import GBuffer, mirrored
-from polarguide.shading.result import MetalPixels
+from polarguide.shading.model import GBuffer
+from polarguide.shading.result import MetalPixels, first_channel
 from polarguide.shading.roughness import LEVELS
 
 
@@ -28,30 +27,30 @@ class MetalArguments(NamedTuple):
     """Arguments of the native pass for metals, see ``shading.metal``.
 
     Attributes:
-        pixels: [K] int64, those that show metal, ascending.
-        first: the channel where ``metal_channels`` begin.
-        least_share: of metal.
+        pixels: [K] int64 indices of pixels that show metal, ascending.
+        first: first of the four channels of metals.
+        least_share: metalness of a pixel below which it is shaded as a dielectric.
     """
 
     pixels: Tensor
     first: int
-    least_share: float
+    least_share: float = MINIMUM_SHARE
 
 
 class ReflectArguments(NamedTuple):
     """Arguments of ``reflect_native`` from a shading model and its G-buffer.
 
     Attributes:
-        fresnel: whether light is radiance with Fresnel's weight; otherwise a lerp with the logistic function of texels.
-        local: whether channels 7 to 9 are light that is added to the environment's.
+        fresnel: True: light is radiance with Fresnel's weight. False: a lerp with the logistic function of texels.
+        local: True if channels 7 to 9 are local light, which is added to the environment's.
         refractive_index: refractive index of Fresnel's weight.
         index_channel: channel of the offset of the refractive index, without a gradient; -1: no such channel.
         blur_channel: channel of the blended blur; -1: all surfaces are mirrors.
-        blur: mip levels from a mirror to a blur of 1.
+        blur: number of mip levels from a mirror to a blur of 1.
         alpha: [P] divisor of the blended blur, without a gradient.
-        metal: metals in the picture, which are added to ``final`` and ``specular``; None without metals.
-        detached: whether to return ``specular`` and ``diffuse`` also without a gradient on the normals, other than by
-            the light that metals mirror.
+        metal: metals in the picture, added to ``final`` and ``specular``; None without metals.
+        detached: True: also return ``specular`` and ``diffuse`` without a gradient on the normals. Light that metals
+            mirror keeps this gradient.
     """
 
     fresnel: bool
@@ -66,7 +65,7 @@ class ReflectArguments(NamedTuple):
 
     @property
     def shading(self) -> dict[str, Any]:
-        """Arguments of the native functions about the weight of the light."""
+        """Arguments of the native functions for the weight of the light."""
         return {
             "fresnel": self.fresnel,
             "local": self.local,
@@ -76,7 +75,7 @@ class ReflectArguments(NamedTuple):
 
     @property
     def level(self) -> dict[str, Any]:
-        """Arguments of the native functions about the mip level of the light."""
+        """Arguments of the native functions for the mip level of the light."""
         return {"roughness": self.blur_channel, "blur": self.blur, "alpha": self.alpha}
 
     @property
@@ -198,7 +197,7 @@ class _Reflect(torch.autograd.Function):
 
 
 def world_rays_native(camera: Camera) -> Tensor:
-    """``Camera.world_rays`` in float32 on the CPU, in one pass: [P, 3]."""
+    """Return ``Camera.world_rays`` in float32 on the CPU, computed in one pass: [P, 3]."""
     rays = camera.rays().flatten(0, 1)
     turned = torch.empty_like(rays)
     _native.turn(rays, camera.pose(torch.float32, rays.device).rotation.flatten().tolist(), turned)
@@ -208,56 +207,56 @@ def world_rays_native(camera: Camera) -> Tensor:
 def reflect_native(
     features: Tensor, rays: Tensor, textures: Sequence[Tensor], given: ReflectArguments
 ) -> tuple[Tensor, ...]:
-    """The layers of a picture from its G-buffer (Ye et al. 2024, Eq. 5, or Fresnel-weighted), with what metals reflect.
+    """Shade a G-buffer by deferred reflection (Ye et al. 2024, Eq. 5, or Fresnel-weighted).
+
+    All tensors are float32 on the CPU.
 
     Args:
-        features: [P, D] blended base color, normal, strength and, with ``local``, light; others may follow.
+        features: [P, D] blended base color, normal, strength and, with ``local``, light; other channels may follow.
         rays: [P, 3] unit, world.
-        textures: levels of the light from afar, [6, R, R, 3] each: radiance with ``fresnel``, else one, raw. All
-            float32 on the CPU.
+        textures: mip levels of the light from afar, [6, R, R, 3] each: radiance with ``fresnel``, else one raw level.
+        given: arguments of the shading.
 
     Returns:
         ``final``, ``specular``, ``diffuse`` and ``reflection``, each [P, 3], differentiable in features and textures.
         With ``detached`` also the two detached layers. With ``metal`` also its share [K] (no gradient), its reflected
-        light [K, 3], and its degree of polarization over ``sin^2(zenith)`` [K, 3]. The bits are the same for any
-        number of threads.
+        light [K, 3], and its degree of polarization over ``sin^2(zenith)`` [K, 3]. The number of threads does not
+        change a bit.
 
     Raises:
-        ValueError: if a shape is not as above.
+        ValueError: a shape does not fit.
     """
     layers: tuple[Tensor, ...] = applied(_Reflect, features, rays, given, *textures)
     return layers
 
 
-def reflect_arguments(
-    splatted: GBuffer, fresnel: bool, local: bool, refractive_index: float
-) -> ReflectArguments:
-    """Arguments of ``reflect_native`` for a G-buffer, by the channels that it has."""
-    layout = splatted.layout
-    arguments = ReflectArguments(
-        fresnel, local, refractive_index, index_channel=layout.first("index"), detached=splatted.detached
-    )
-    if "blur" in layout:
-        alpha = splatted.alpha.detach().flatten()
-        arguments = arguments._replace(blur_channel=layout.first("blur"), blur=LEVELS, alpha=alpha)
-    if "metal" in layout:
-        first = layout.first("metal")
-        pixels = where_metal(splatted.features.flatten(0, 1), first)
-        arguments = arguments._replace(metal=MetalArguments(pixels, first, MINIMUM_SHARE))
-    return arguments
-
-
 def shade_native(
-    splatted: GBuffer, textures: Sequence[Tensor], camera: Camera, given: ReflectArguments
+    splatted: GBuffer,
+    textures: Sequence[Tensor],
+    camera: Camera,
+    *,
+    fresnel: bool,
+    local: bool,
+    refractive_index: float,
 ) -> dict[str, Any]:
     """Return the layers of ``reflect_native`` by name, [H, W, 3] each, and ``metal``, None without metals."""
-    outputs = reflect_native(splatted.features.flatten(0, 1), world_rays_native(camera), textures, given)
+    layout = splatted.layout
+    features = splatted.features.flatten(0, 1)
+    index_channel = first_channel(layout, "index")
+    given = ReflectArguments(fresnel, local, refractive_index, index_channel, detached=splatted.detached)
+    if "blur" in layout:
+        alpha = splatted.alpha.detach().flatten()
+        given = given._replace(blur_channel=first_channel(layout, "blur"), blur=LEVELS, alpha=alpha)
+    if "reflectance" in layout:
+        first = first_channel(layout, "reflectance")
+        given = given._replace(metal=MetalArguments(where_metal(features, first), first))
+    outputs = reflect_native(features, world_rays_native(camera), textures, given)
     shaded = dict(zip(given.outputs, outputs, strict=True))
-    shown = [] if given.metal is None else [shaded.pop(name) for name in _METAL]
-    size = splatted.features.shape[:2]
-    layers: dict[str, Any] = {name: layer.unflatten(0, size) for name, layer in shaded.items()}
-    layers["metal"] = None if given.metal is None else MetalPixels(given.metal.pixels, *shown)
-    return layers
+    metal = None
+    if given.metal is not None:
+        metal = MetalPixels(given.metal.pixels, *(shaded.pop(name) for name in _METAL))
+    size = splatted.alpha.shape
+    return {**{name: layer.unflatten(0, size) for name, layer in shaded.items()}, "metal": metal}
 
 
 class _GBufferSplit(torch.autograd.Function):
@@ -298,64 +297,18 @@ class _GBufferSplit(torch.autograd.Function):
 
 
 def split_native(features: Tensor, alpha: Tensor, *, depth: bool) -> tuple[Tensor, Tensor, Tensor | None]:
-    """The blended normal and the depth of a G-buffer, with one gradient pass for them and whatever else is read.
+    """Split the blended normal and the depth from a G-buffer, with one gradient pass for all results.
 
     Args:
-        features: [H, W, D] blended color, normal and at least one channel more. alpha: [H, W]. Both float32 on the CPU.
-        depth: whether the last channel is the depth times alpha.
+        features: [H, W, D] blended color, normal and at least one further channel; float32 on the CPU.
+        alpha: [H, W], float32 on the CPU.
+        depth: True if the last channel is the depth times alpha.
 
     Returns:
-        ``features`` for whoever else reads them, the normal [H, W, 3] and the depth [H, W] or None.
+        ``features`` for other readers, the normal [H, W, 3] and the depth [H, W] or None.
 
     Raises:
-        ValueError: if a shape is not as above.
+        ValueError: a shape does not fit.
     """
     rest, normal, deep = _GBufferSplit.apply(features, alpha, depth)
     return rest, normal, deep
-
-
-class Reflecting(Protocol):
-    """The interface between deferred reflection and its shading model; see ``DeferredShading``."""
-
-    def far_light(self, texels: Tensor, directions: Tensor, level: Tensor | None, /) -> Tensor:
-        """Linear radiance [P, 3] from directions [P, 3], blurred by mip levels [P]; None: by none."""
-
-    def contributions(
-        self, base: Tensor, strength: Tensor, light: Tensor, cosine: Tensor, index: Tensor | None, /
-    ) -> tuple[Tensor, Tensor]:
-        """Specular and diffuse contributions [..., 3]."""
-
-
-def reflect_reference(
-    base: Tensor,
-    normal: Tensor,
-    strength: Tensor,
-    environment: Tensor,
-    camera: Camera,
-    shading: Reflecting,
-    local: Tensor | None = None,
-    index: Tensor | None = None,
-    level: Tensor | None = None,
-) -> dict[str, Tensor]:
-    """Deferred reflection per pixel: the reference implementation of ``reflect_native``, any dtype and device.
-
-    Args:
-        base: [H, W, 3]. normal: [H, W, 3] world, any length. strength: [H, W]. environment: [6, R, R, 3] raw texels.
-        local: [H, W, 3] blended light of the Gaussians' own, added to the environment's.
-        index: [H, W] refractive index; None: the run's.
-        level: [H, W] mip level of the environment; None: everything is a mirror.
-
-    Returns:
-        ``final``, ``specular``, ``diffuse`` and ``reflection``, each [H, W, 3].
-    """
-    rays = camera.world_rays(dtype=base.dtype, device=base.device)
-    facing = unit(normal, 1e-3)
-    directions = mirrored(rays, facing).reshape(-1, 3).contiguous()
-    levels = None if level is None else level.flatten()
-    light = shading.far_light(environment, directions, levels).reshape(base.shape)
-    if local is not None:
-        light = (light + local).clamp(min=0)
-    cosine = -dot(rays, facing)[..., None].clamp(-1, 0)
-    indices = None if index is None else index[..., None]
-    specular, diffuse = shading.contributions(base, strength[..., None], light, cosine, indices)
-    return {"final": specular + diffuse, "specular": specular, "diffuse": diffuse, "reflection": light}

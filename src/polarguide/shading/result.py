@@ -1,9 +1,10 @@
-"""The one render result, the same in every stage and recipe, and the layout of the G-buffer that it is made of."""
+"""Render result, the same in every stage and recipe, and the channels of the G-buffer from which it is made."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from itertools import accumulate
 from typing import NamedTuple
 
 import torch
@@ -12,45 +13,23 @@ from torch import Tensor
 from polarguide import optics
 
 COLOR_CHANNELS = (0, 1, 2)
+"""Channels of the base color in a G-buffer."""
 NORMAL_CHANNELS = (3, 4, 5)
+"""Channels of the normal in a G-buffer with normals."""
+ChannelSlices = Mapping[str, slice]
+"""Channels of a G-buffer by name. Their order is color, normal (if splatted), channels of the shading model, and depth
+(if splatted). The native passes rely on it."""
 
 
-@dataclass(frozen=True)
-class Layout:
-    """Names of a G-buffer's channels.
+def channel_slices(widths: Mapping[str, int]) -> dict[str, slice]:
+    """Return the slice of each name, given the number of its channels; names are in the order of the channels."""
+    ends = accumulate(widths.values())
+    return {name: slice(end - width, end) for (name, width), end in zip(widths.items(), ends, strict=True)}
 
-    The order is always color, normal (if splatted), the shading model's channels, and depth (if splatted). The native
-    passes rely on it.
 
-    Attributes:
-        widths: number of channels of each name, in the order in which they lie.
-    """
-
-    widths: Mapping[str, int]
-
-    def __contains__(self, name: str) -> bool:
-        return name in self.widths
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self.widths)
-
-    def first(self, name: str) -> int:
-        """The first channel of a name; -1 if there is none."""
-        begin = 0
-        for other, width in self.widths.items():
-            if other == name:
-                return begin
-            begin += width
-        return -1
-
-    def channels(self, name: str) -> slice:
-        """The channels of a name.
-
-        Raises:
-            KeyError: there are none.
-        """
-        begin = self.first(name)
-        return slice(begin, begin + self.widths[name])
+def first_channel(channels: ChannelSlices, name: str) -> int:
+    """Return the first channel of a name; -1 without such channels."""
+    return channels[name].start if name in channels else -1
 
 
 LAYERS = (
@@ -66,20 +45,20 @@ LAYERS = (
     "depth",
     "alpha",
 )
-"""The pictures in a ``RenderResult``, by name."""
+"""Names of the pictures in a ``RenderResult``."""
 POLARIZED = ("stokes", "dolp", "aolp")
-"""What a result with ``predicted`` Stokes vectors has besides. What a view's pictures say of the same has these names
-with ``, measured``."""
+"""Names of the layers that predicted Stokes vectors add. Layers measured by a view have these names followed by
+``, measured``."""
 
 
 class MetalPixels(NamedTuple):
-    """Metals in a picture of P pixels.
+    """Pixels of a picture that show metal.
 
     Attributes:
-        pixels: [K] int64, those that show metal, ascending.
+        pixels: [K] int64 indices of the pixels, ascending.
         share: [K] blended metalness in [0, 1], without a gradient.
-        specular: [K, 3] what metals reflect there.
-        slope: [K, 3] its degree of polarization over ``sin^2(zenith)``.
+        specular: [K, 3] contribution of metals to the specular layer.
+        slope: [K, 3] degree of polarization of this contribution over ``sin^2(zenith)``.
     """
 
     pixels: Tensor
@@ -90,36 +69,37 @@ class MetalPixels(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class RenderResult:
-    """A rendered view: its layers by name, and tensors that training alone reads.
+    """Rendered view: layers by name, and tensors for training.
 
-    Radiance is linear, on the scale of S0/2. ``final``, ``base`` and ``alpha`` are always there, ``normal`` and
-    ``depth`` where they were requested, the other layers where the shading model has them.
+    Radiance is linear, on the scale of S0/2. Every result has ``final``, ``base`` and ``alpha``. It has ``normal`` and
+    ``depth`` if they were requested, and other layers if the shading model has them.
 
     Attributes:
         layers: by name, [H, W, 3] unless stated otherwise.
 
-            - ``final``: the picture; ``specular + diffuse`` of a model that reflects.
+            - ``final``: the picture; ``specular + diffuse`` for a model that reflects.
             - ``specular``, ``diffuse``: contributions of reflection and of the base color to the picture.
             - ``base``: blended base color.
             - ``reflection``: the environment along the mirrored ray.
             - ``strength``: [H, W] reflection strength in [0, 1].
             - ``roughness``: [H, W] square root of GGX's alpha, as in glTF; no gradient.
             - ``metalness``: [H, W] share of metals in [0, 1].
+            - ``reflectance``: reflectance of metals at normal incidence, no gradient; only if there are metals.
             - ``normal``: blended normal in world axes, not normalized. If the surface was requested, the normal around
               the pixel's median depth, see ``raster.surface``.
-            - ``depth``: [H, W] expected camera depth over alpha; if the surface was requested, around the median.
+            - ``depth``: [H, W] expected camera depth over alpha; around the median if the surface was requested.
             - ``alpha``: [H, W] in [0, 1].
-            - ``shaded_normal``: the normal of the shading, where ``normal`` is that of the surface.
-            - ``index``: [H, W] refractive index, no gradient, where it is not the run's everywhere.
+            - ``shaded_normal``: the normal of the shading, if ``normal`` is the normal of the surface.
+            - ``index``: [H, W] refractive index, no gradient; only if Gaussians have several.
             - ``stokes``, ``dolp``, ``aolp``: see ``polarized_layers``.
 
         metal: contribution of metals to ``specular``; None without metals.
-        training: tensors that training alone reads, by name.
+        training: tensors for training by name.
 
-            - ``radii``: [N] pixels, of the projected Gaussians; 0 where culled.
+            - ``radii``: [N] radii of the projected Gaussians in pixels; 0 if culled.
             - ``detached_specular``, ``detached_diffuse``: the layers without a gradient on the normals.
-            - ``rotation_only_normal``: the blended normal with a gradient that rotates Gaussians, but neither moves
-              them nor changes their opacity.
+            - ``rotation_only_normal``: the blended normal. Its gradient rotates Gaussians and leaves their
+              position and opacity unchanged.
     """
 
     layers: Mapping[str, Tensor]
@@ -128,7 +108,7 @@ class RenderResult:
 
     @property
     def final(self) -> Tensor:
-        """The picture, [H, W, 3]."""
+        """Picture, [H, W, 3]."""
         return self.layers["final"]
 
     @property
@@ -152,7 +132,7 @@ class RenderResult:
         return self.layers["depth"]
 
     def __getattr__(self, name: str) -> Tensor | None:
-        """An optional layer as an attribute: ``result.strength``; None where the rendering does not have it."""
+        """Return an optional layer, such as ``result.strength``; None if the rendering lacks it."""
         if name not in LAYERS:
             raise AttributeError(f"RenderResult has no layer {name!r}")
         return self.layers.get(name)
@@ -164,28 +144,28 @@ class RenderResult:
 
     @property
     def is_polarized(self) -> bool:
-        """True if both lobes and the normal exist, from which Stokes vectors are predicted."""
+        """True if the result has both lobes and the normal, which Stokes vectors are predicted from."""
         return {"specular", "diffuse", "normal"} <= self.layers.keys()
 
     def with_layers(self, **layers: Tensor) -> RenderResult:
-        """A copy with layers added or replaced."""
+        """Return a copy with layers added or replaced."""
         return replace(self, layers={**self.layers, **layers})
 
     def to(self, device: torch.device | str) -> RenderResult:
-        """The layers on a device, without the tensors of training."""
+        """Return the layers on a device, without the tensors for training."""
         layers = {name: layer.to(device) for name, layer in self.layers.items()}
         metal = None if self.metal is None else MetalPixels(*(t.to(device) for t in self.metal))
         return RenderResult(layers, metal)
 
 
 def polarized_layers(stokes: Tensor) -> dict[str, Tensor]:
-    """Layers of predicted polarization by the names of ``POLARIZED``.
+    """Return layers of predicted polarization by the names of ``POLARIZED``.
 
     Args:
         stokes: [3, H, W, 3] Stokes vectors in the lens frame, as in ``View.stokes``; S0 is twice the picture.
 
     Returns:
-        ``stokes``, and of its luminance the ``dolp`` [H, W] in [0, 1] and the ``aolp`` [H, W] in [0, pi) radians.
+        ``stokes``; the ``dolp`` [H, W] in [0, 1] and the ``aolp`` [H, W] in [0, pi) radians of its luminance.
     """
     luminance = optics.luminance(stokes)
     return {"stokes": stokes, "dolp": optics.dolp(luminance), "aolp": optics.aolp(luminance)}

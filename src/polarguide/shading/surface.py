@@ -1,24 +1,24 @@
-"""Surface properties: values of each Gaussian that a shading model learns, blends per pixel, and exports."""
+"""Surface properties: values of each Gaussian that a shading model learns, blends per pixel and exports."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from polarguide.gaussians.gaussians import Parameters
+from polarguide.gaussians.gaussians import Parameters, any_nonzero
 
 
 class Parameter(NamedTuple):
-    """A tensor that a shading model trains.
+    """Tensor that a shading model trains.
 
     Attributes:
-        shape: shape of one Gaussian's values; of the whole tensor for a parameter of the light.
-        rate: learning rate (Adam); with 0 it keeps its first values.
-        reset_minimum: a reset of the opacities raises values to at least this; None: it leaves them.
+        shape: shape of the values of one Gaussian, or of the whole tensor for a parameter of the light.
+        rate: learning rate of Adam; with 0 the tensor keeps its first values.
+        reset_minimum: lower bound of the values after a reset of the opacities; None: no bound.
     """
 
     shape: tuple[int, ...]
@@ -28,12 +28,12 @@ class Parameter(NamedTuple):
 
 @dataclass(frozen=True)
 class GltfTexture:
-    """A texture of a glTF material that holds a surface property.
+    """Texture of a glTF material that holds a surface property.
 
     Attributes:
         extension: name of the material extension that has the texture.
         texture: name of the texture in the extension.
-        constants: further entries of the extension, such as the factor that readers multiply with the texture.
+        constants: further entries of the extension, such as the factor of the texture.
     """
 
     extension: str
@@ -47,21 +47,20 @@ def _identity(values: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class SurfaceProperty:
-    """A property of surfaces, from its parameter to exported files.
+    """Property of surfaces, from its parameter to exported files.
 
     Attributes:
-        name: name of the property in files, and of the splatted channels and the layer of a property in
-            ``ShadingModel.added_surface``.
+        name: name of the splatted channels, of the layer and of the field in files.
         parameter: name of the per-Gaussian tensor.
         channels: number of values of a Gaussian.
-        activation: values of the parameter's raw numbers.
-        inverse: raw numbers of values.
+        activation: function from the raw numbers of the parameter to values.
+        inverse: function from values to raw numbers.
         initial: value before the first step.
         rate: learning rate of the parameter; with 0 it is not learned.
-        reset_minimum: minimum of the raw numbers after a reset of the opacities; None: a reset leaves them.
-        unit: unit of the values; "1" for a ratio.
-        gltf: texture of a GLB that holds an added property with values in [0, 1]; None: no texture.
-        slot: name of the value in an exported page's records, see ``results.export.share.SLOTS``; "": not on pages.
+        reset_minimum: lower bound of the raw numbers after a reset of the opacities; None: no bound.
+        gltf: texture of a GLB that holds the property, with values in [0, 1]; None: no texture.
+        weight: name of a parameter that is not learned and multiplies the splatted values. If it is 0 everywhere, the
+            property is not splatted. The property's own parameter multiplies nothing. "": no weight.
     """
 
     name: str
@@ -72,9 +71,8 @@ class SurfaceProperty:
     initial: float = 0.0
     rate: float = 0.0
     reset_minimum: float | None = None
-    unit: str = "1"
     gltf: GltfTexture | None = None
-    slot: str = ""
+    weight: str = ""
 
     @property
     def learned(self) -> Parameter:
@@ -83,9 +81,24 @@ class SurfaceProperty:
         return Parameter(shape, self.rate, self.reset_minimum)
 
     def first(self, count: int) -> Tensor:
-        """Return the raw numbers of so many Gaussians before the first step."""
+        """Return the raw numbers of ``count`` Gaussians before the first step."""
         return self.inverse(torch.full((count, *self.learned.shape), self.initial))
 
     def values(self, gaussians: Parameters) -> Tensor:
         """Return the values of the Gaussians, [N] or [N, channels]."""
         return self.activation(gaussians[self.parameter])
+
+    def splatted(self, gaussians: Parameters) -> Tensor | None:
+        """Return the splatted values [N, channels]; None if the weight is 0 everywhere."""
+        if self.weight and not any_nonzero(gaussians, self.weight):
+            return None
+        values = self.values(gaussians).reshape(-1, self.channels)
+        if self.weight == self.parameter:
+            return values.detach()
+        return gaussians[self.weight].detach()[:, None] * values if self.weight else values
+
+
+def surface_channels(properties: Iterable[SurfaceProperty], gaussians: Parameters) -> dict[str, Tensor]:
+    """Return the splatted values [N, C] of surface properties by name, without those whose weight is 0 everywhere."""
+    channels = {row.name: row.splatted(gaussians) for row in properties}
+    return {name: values for name, values in channels.items() if values is not None}

@@ -102,7 +102,7 @@ class Materials:
         return self._paint(torch.from_numpy(np.isfinite(lengths)), kind)
 
     def undo(self) -> bool:
-        """Undo the last stroke; returns False if there is none."""
+        """Undo the last stroke, and return False without a stroke."""
         if self._before:
             self.kinds = self._before.pop()
             return True
@@ -126,9 +126,7 @@ class Materials:
         return int(which.sum())
 
     def _painted(self, camera: Camera, place: Sequence[float], size: float) -> tuple[Tensor, Tensor]:
-        """Return the number of pixels that each Gaussian fills in a disc of a picture, and in the whole picture: [N]
-        both.
-        """
+        """Return the number of pixels of each Gaussian in a disc of a picture, and in the picture: [N] both."""
         scale = min(1.0, LOOKED_AT / camera.height)
         small = camera.scaled(
             scale, max(1, round(scale * camera.width)), max(1, round(scale * camera.height))
@@ -184,8 +182,7 @@ def _averaged(axes: Tensor, colors: Tensor, weights: Tensor, near: Tensor) -> tu
 def kinds_of(
     gaussians: Gaussians, rasterize: Rasterize, views: Sequence[View], numbers: Mapping[str, Tensor]
 ) -> Tensor:
-    """Return the material of each Gaussian by pictures of materials: the one that fills most of its pixels, [N]
-    uint8.
+    """Return the material of each Gaussian from pictures of materials: the one of most of its pixels, [N] uint8.
 
     Args:
         gaussians, rasterize: the model.

@@ -11,7 +11,7 @@ import msgspec
 
 from polarguide.capture.presentation import STOPS, Crop, Presentation, Vector
 from polarguide.core.errors import PolarguideError
-from polarguide.viewer.messages import Accepts, choice, flag, number, pair, push
+from polarguide.viewer.guard import Accepts, choice, flag, number, pair, push
 from polarguide.viewer.scenery import MEASURED, UNCHANGED, Appearance
 
 FREE_VIEW = "(free)"
@@ -89,12 +89,12 @@ def controls_of(options: PanelOptions) -> dict[str, dict[str, Control]]:
     kinds = tuple(options.kinds)
     painting = {
         "tool": Control("dropdown", "Paint", (TOOLS,), choice(TOOLS), {
-            "initial_value": OFF, "hint": "A click paints a surface that hangs together, or what is in a disc"}),
+            "initial_value": OFF, "hint": "A click paints a connected surface, or a disc"}),
         "kind": Control("dropdown", "As", (kinds,), choice(kinds), {"initial_value": METAL}),
         "size": Control("slider", "Size", (*SIZE, 0.5, 1.0), number(*SIZE), {
-            "hint": "Of the disc, in percent of the height"}),
+            "hint": "Size of the disc in percent of the picture's height"}),
         "reach": Control("slider", "Reach", (*REACH, 0.5, 4.0), number(*REACH), {
-            "hint": "How unlike neighbors a surface goes on over"}),
+            "hint": "Tolerated difference of neighbors on a surface"}),
         "undo": Control("button", "Undo"),
         "save_materials": Control("button", "Save materials to the run", options={
             "hint": "polarguide train --resume then goes on with them"}),
@@ -169,8 +169,7 @@ class Panel:
         changed: callback after every change of the picture.
         drop: callback with the exception of another callback.
         folded: whether the controls are in a closed folder. On a phone viser's panel is open at first and covers half
-            of
-            the picture, and a server cannot fold it.
+            of the picture, and a server cannot fold it.
     """
 
     def __init__(
@@ -223,8 +222,9 @@ class Panel:
         subscribe(self.caught(act))
 
     def caught(self, act: Callable[[], None]) -> Callable[[Any], None]:
-        """Return a callback that shows a visitor's mistake as a note. Other errors close only this browser's
-        connection.
+        """Return a callback that shows a user's mistake as a note.
+
+        Other errors close only the connection of this browser.
         """
 
         def called(_: Any) -> None:

@@ -106,7 +106,7 @@ class Presenting:
 
     @property
     def picks(self) -> bool:
-        """Whether the next click is a pick."""
+        """True if the next click is a pick."""
         return self._clicks.wanted
 
     def take_click(self) -> tuple[float, float] | None:

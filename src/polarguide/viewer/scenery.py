@@ -23,9 +23,9 @@ from polarguide.shading.result import POLARIZED, RenderResult, polarized_layers
 from polarguide.training.loop import TrainingLoop
 from polarguide.viewer.cameras import drawn_camera, letterboxed
 from polarguide.visualization import figures
-from polarguide.visualization.figures import Picture
-from polarguide.visualization.layers import (
+from polarguide.visualization.figures import (
     RADIANCE,
+    Picture,
     depth_range,
     layer_picture,
     layer_scale,
@@ -162,8 +162,7 @@ class Appearance:
         strength: factor on the specular layer. Predicted polarization is always that of the learned layers.
         turn: rotation of the far environment in degrees, counter-clockwise seen from above.
         wipe: share of the picture's width, from the left, that shows the other run in place of the layer; without
-            another
-            run, the measured layer (``BESIDE``) at a photograph's pose.
+            another run, the measured layer (``BESIDE``) at a photograph's pose.
         presentation: color, exposure, up axis and crop box. Without a crop box all of the scene is shown.
     """
 
@@ -229,8 +228,9 @@ class Painter:
     def _wiped(
         self, picture: Picture, scenery: Scenery, camera: Camera, view: View | None, appearance: Appearance
     ) -> Picture:
-        """Draw the other run, or the measured layer, over the left part of a picture. Without them, return the
-        picture.
+        """Draw the other run, or the measured layer, over the left part of a picture.
+
+        Without them, return the picture.
         """
         other = BESIDE.get(appearance.layer)
         left = None

@@ -40,8 +40,7 @@ from polarguide.runs.train import Ends, Look
 from polarguide.shading.model import ShadingModel
 from polarguide.training.loop import TrainingLoop
 from polarguide.viewer.cameras import Photograph, photographs
-from polarguide.viewer.guard import Gate, guarded
-from polarguide.viewer.messages import Accepts, checked_message
+from polarguide.viewer.guard import Accepts, Gate, checked_message, guarded
 from polarguide.viewer.painting import Materials, Paintable, kinds_of
 from polarguide.viewer.panel import KINDS, PanelOptions
 from polarguide.viewer.scenery import UNCHANGED, Scenery, run_scenery, training_scenery
@@ -144,7 +143,7 @@ class Viewer:
 
     @property
     def paused(self) -> bool:
-        """Whether a session pauses the training."""
+        """True if a session pauses the training."""
         with self._lock:
             return any(session.paused for session in self._sessions.values())
 
@@ -203,7 +202,7 @@ class Viewer:
         """Close the connection of a browser. The server and a training continue."""
         with self._lock:
             removed = self._sessions.pop(client_id, None) is not None
-        text = f"the viewer let a browser go: {type(error).__name__}: {error}"
+        text = f"the viewer disconnected a browser: {type(error).__name__}: {error}"
         if removed and text not in self._warned:
             self._warned.add(text)
             self._warn(text)
@@ -222,7 +221,7 @@ class Viewer:
             timeout: longest time in seconds to wait for one.
 
         Returns:
-            Whether a picture was rendered.
+            True if a picture was rendered.
         """
         deadline = time.monotonic() + timeout
         while True:
@@ -236,7 +235,7 @@ class Viewer:
             self._wake.wait(min(left, TICK if self._sessions else 1.0))
 
     def _draw_next(self) -> bool:
-        """Render the picture that has been due for longest; returns whether one was due."""
+        """Render the picture that has been due for longest, and return False if none was due."""
         with self._lock:
             sessions = sorted(self._sessions.values(), key=lambda session: session.pacing.last_frame)
         for session in sessions:
@@ -445,7 +444,9 @@ def _opened(
     )
     with closing(viewer):
         if host not in LOOPBACK:
-            reporter.warn(f"whoever reaches {host} over the network can look: there is no password")
+            reporter.warn(
+                f"every user with network access to {host} can open the viewer: there is no password"
+            )
             for line in from_elsewhere(host, viewer.port):
                 reporter.say(line)
         reporter.say(f"viewer: {viewer.address}")

@@ -192,12 +192,12 @@ class Session:
 
     @property
     def client_id(self) -> int:
-        """viser's number of the browser."""
+        """Number of the browser in viser."""
         return int(self._client.client_id)
 
     @property
     def paused(self) -> bool:
-        """Whether this session pauses the training."""
+        """True if this session pauses the training."""
         return bool(self.panel["pause"].value)
 
     def _soon_again(self, what: str) -> bool:

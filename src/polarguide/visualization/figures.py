@@ -1,4 +1,4 @@
-"""Arrays as 8-bit pictures, uint8 RGB [H, W, 3]: false colors, PNG files and contact sheets."""
+"""8-bit pictures, uint8 RGB [H, W, 3], of arrays and layers: false colors, PNG files and contact sheets."""
 
 from __future__ import annotations
 
@@ -16,9 +16,13 @@ from PIL import Image, ImageDraw, ImageFont
 from PIL.PngImagePlugin import PngInfo
 from torch import Tensor
 
+from polarguide import optics
+from polarguide.capture import View
+from polarguide.capture.presentation import colored
 from polarguide.core.files import write_whole
 from polarguide.geometry.camera import Camera
 from polarguide.optics.color import shown
+from polarguide.shading.result import POLARIZED, RenderResult
 
 Picture = NDArray[np.uint8]
 """uint8 RGB [H, W, 3]."""
@@ -30,7 +34,7 @@ FONT_SIZE = 18
 SMALLEST_FONT_SIZE = 10
 LINE_HEIGHT = 28
 READ_AT = 384
-"""Width of a tile up to which the font size is constant. The type grows with larger tiles."""
+"""Width of a tile up to which the font size is constant. Larger tiles have larger type."""
 
 
 def contact_sheet(
@@ -44,26 +48,26 @@ def contact_sheet(
     gutter: int = 8,
     caption: str = "",
 ) -> Picture:
-    """Lay pictures out in rows and columns, with labels on top and to the left, on white.
+    """Arrange pictures in rows and columns on white, with labels on top and to the left.
 
-    All tiles get one size. Small pictures are enlarged by a whole factor to at least ``minimum_width``
-    without smoothing, large ones reduced to ``maximum_width`` by area averages. A picture of another size
-    than the rest is fitted into its tile and centered.
+    All tiles have one size. Small pictures are enlarged by an integer factor without smoothing to at least
+    ``minimum_width``. Large pictures are reduced to ``maximum_width`` by area averages. A picture of another
+    size is fitted into its tile and centered.
 
     Args:
-        rows: the pictures, uint8 RGB [H, W, 3]; None, or a row that ends early, leaves the place blank.
+        rows: the pictures, uint8 RGB [H, W, 3]. None and the end of a short row leave a tile blank.
         row_labels: one per row.
         column_labels: one per column. Characters outside ASCII are drawn as "?".
-        footer: pictures below the columns, such as scales, as wide as a tile and as high as they then are.
+        footer: pictures below the columns, such as scales, scaled to the width of a tile.
         minimum_width, maximum_width: bounds of a tile's width in pixels.
         gutter: pixels between tiles and around the sheet.
-        caption: a line of text below everything.
+        caption: a line of text at the bottom.
 
     Returns:
         uint8 RGB picture.
 
     Raises:
-        ValueError: labels that do not match the rows, no picture at all, or something that is not a picture.
+        ValueError: the labels do not match the rows, there is no picture, or an array is not a picture.
     """
     columns = len(column_labels)
     if len(rows) != len(row_labels) or any(len(row) > columns for row in rows):
@@ -76,7 +80,7 @@ def contact_sheet(
         check_picture(picture, "contact sheet")
     if not pictures:
         raise ValueError("contact sheet: expected at least one picture, found none")
-    # A whole factor keeps the pixels of an enlarged picture square and equal.
+    # An integer factor keeps the pixels of an enlarged picture equal.
     widest = max(picture.shape[1] for picture in pictures)
     width = min(widest * max(1, math.ceil(minimum_width / widest)), maximum_width)
     height = _height_at(width, pictures)
@@ -131,10 +135,10 @@ def _place(sheet: Image.Image, picture: Picture, tile: tuple[int, int, int, int]
 
 
 def _write(sheet: Image.Image, text: str, x: int, y: int, width: int, larger: float) -> None:
-    """Draw text centered in ``width`` pixels from ``x``, around the line ``y``; smaller if it has to be.
+    """Draw text centered in ``width`` pixels from ``x`` on the line ``y``, with a smaller font if necessary.
 
     Args:
-        larger: how many times as large as on small tiles.
+        larger: scale of the font size.
     """
     text = text.encode("ascii", "replace").decode()
     length = max(1.0, ImageFont.load_default(FONT_SIZE * larger).getlength(text))
@@ -153,12 +157,12 @@ NOTHING: Mapping[str, str] = MappingProxyType({})
 
 
 def radiance_to_rgb(linear: Tensor) -> Picture:
-    """Return linear radiance [H, W, 3] as a display shows it: clipped to [0, 1], sRGB. NaN is black."""
+    """Convert linear radiance [H, W, 3] to a displayed picture: clipped to [0, 1], sRGB. NaN is black."""
     return _to_uint8(shown(linear.detach().nan_to_num(nan=0.0)))
 
 
 def normal_to_rgb(normals_world: Tensor, camera: Camera) -> Picture:
-    """World normals in the usual colors: camera-space (x, -y, -z) from [-1, 1] to [0, 255].
+    """Convert world normals to the usual colors: camera-space (x, -y, -z) from [-1, 1] to [0, 255].
 
     Right is red, up is green, toward the camera is blue.
 
@@ -167,7 +171,7 @@ def normal_to_rgb(normals_world: Tensor, camera: Camera) -> Picture:
         camera: the view.
 
     Returns:
-        uint8 [H, W, 3]; mid gray (128) where there is no normal (zero or not finite).
+        uint8 [H, W, 3]; mid gray (128) for missing normals (zero or not finite).
     """
     normals = camera.to_camera(normals_world.detach().to("cpu", torch.float64).nan_to_num(0.0, 0.0, 0.0))
     length = torch.linalg.vector_norm(normals, dim=-1, keepdim=True)
@@ -182,18 +186,18 @@ def scalar_to_rgb(
     high: float,
     colormap: str = "viridis",
 ) -> Picture:
-    """A map of numbers in false colors.
+    """Convert numbers to false colors.
 
     Args:
         values: [H, W].
-        low, high: the values at the two ends of the color map, ``low < high``; beyond them colors saturate.
+        low, high: values at the ends of the color map, ``low < high``. Colors saturate outside.
         colormap: a name in ``COLOR_MAPS``.
 
     Returns:
-        uint8 [H, W, 3]; black where the value is not finite.
+        uint8 [H, W, 3]; black for values that are not finite.
 
     Raises:
-        ValueError: an empty range.
+        ValueError: the range is empty.
     """
     if not low < high:
         raise ValueError(f"range: expected low < high, found {low} and {high}")
@@ -206,27 +210,27 @@ def scalar_to_rgb(
 
 
 def dolp_to_rgb(dolp: Tensor, high: float = 1.0) -> Picture:
-    """Degree of linear polarization [H, W] in [0, 1]: black at 0 to bright at ``high``."""
+    """Convert the degree of linear polarization [H, W] to colors, from black at 0 to bright at ``high``."""
     return scalar_to_rgb(dolp, 0.0, high, "inferno")
 
 
 def aolp_to_rgb(aolp: Tensor, dolp: Tensor | None = None) -> Picture:
-    """Angle of linear polarization as hue, which turns once in pi: 0 is red, pi/3 green, 2 pi/3 blue.
+    """Convert the angle of linear polarization to a hue with period pi: 0 is red, pi/3 green, 2 pi/3 blue.
 
     Args:
         aolp: [H, W] radians, modulo pi.
-        dolp: [H, W] in [0, 1]; if given, it is the brightness, so that the noise of unpolarized pixels stays
-            dark.
+        dolp: [H, W] in [0, 1], used as brightness so that the noise of unpolarized pixels stays dark; None
+            for full brightness.
 
     Returns:
-        uint8 [H, W, 3]; black where a number is not finite.
+        uint8 [H, W, 3]; black for values that are not finite.
     """
     angle = aolp.detach().to("cpu", torch.float64)
     value = torch.ones_like(angle) if dolp is None else dolp.detach().to("cpu", torch.float64)
     valid = angle.isfinite() & value.isfinite()
     third = 2 * math.pi / 3
     hue = 2 * angle.nan_to_num(0.0, 0.0, 0.0)[..., None] - angle.new_tensor([0.0, third, 2 * third])
-    # Distance from each primary on the color circle: a full third on, a full third off, linear between.
+    # Each primary is on within a sixth of the color circle, off beyond a third, and linear between.
     distance = (torch.remainder(hue + math.pi, 2 * math.pi) - math.pi).abs()
     color = (2 - distance / (math.pi / 3)).clamp(0, 1)
     value = torch.where(valid, value.nan_to_num(0.0).clamp(0, 1), 0.0)
@@ -234,28 +238,30 @@ def aolp_to_rgb(aolp: Tensor, dolp: Tensor | None = None) -> Picture:
 
 
 LARGE_ERROR = 0.25
-"""Difference of full brightness."""
+"""Error of full brightness."""
 
 
 def error_to_rgb(pred_linear: Tensor, true_linear: Tensor, high: float = LARGE_ERROR) -> Picture:
-    """Absolute difference of two shown pictures, averaged over channels: black at 0 to bright at ``high``."""
+    """Convert the absolute difference of displayed pictures, mean over channels, to colors from 0 to ``high``."""
     true = shown(true_linear.detach().cpu())
     return scalar_to_rgb((shown(pred_linear.detach().cpu()) - true).abs().mean(-1), 0.0, high, "inferno")
 
 
 def scale_bar(low: float, high: float, colormap: str, unit: str = "", *, middle: str = "") -> Picture:
-    """The colors of ``scalar_to_rgb`` from ``low`` to ``high``, with both numbers below: uint8 RGB [44, 256, 3].
+    """Draw the color scale of ``scalar_to_rgb`` with both limits below: uint8 RGB [44, 256, 3].
 
     Args:
-        unit: behind the last number. middle: what stands at the middle of the bar.
+        unit: unit of the limits. middle: label at the middle of the bar.
     """
     ramp = torch.linspace(low, high, 256).expand(22, -1)
-    texts = f"{low:g}", middle, f"{high:g}{unit and ' '}{unit}"
-    return _bar(scalar_to_rgb(ramp, low, high, colormap), *texts)
+    end = f"{high:g} {unit}".rstrip()
+    return _bar(scalar_to_rgb(ramp, low, high, colormap), f"{low:g}", middle, end)
 
 
 def angle_wheel(scale: float = 1.0) -> Picture:
-    """The colors of ``aolp_to_rgb`` by the direction of the field, darker inward as with less DoLP: [110, 256, 3].
+    """Draw the colors of ``aolp_to_rgb`` by the direction of the field: [110, 256, 3].
+
+    The center is dark like a small DoLP.
 
     Args:
         scale: factor on the size.
@@ -280,7 +286,7 @@ def angle_wheel(scale: float = 1.0) -> Picture:
 
 
 def normal_ball(high: int = 64, width: int = 256) -> Picture:
-    """Return a ball seen from the camera, in the colors of ``normal_to_rgb``: [high, width, 3]."""
+    """Draw a ball in the colors of ``normal_to_rgb``: [high, width, 3]."""
     drawn: Picture = np.full((high, width, 3), BACKGROUND, np.uint8)
     y, x = np.mgrid[0:high, 0:width]
     radius = high * 30 / 64
@@ -326,12 +332,12 @@ def with_name(picture: Picture, name: str) -> Picture:
 
 
 def color_patch(color: int, text: str) -> Picture:
-    """A patch of a gray from 0 to 255, and below it what it means: uint8 RGB [44, 256, 3]."""
+    """Draw a patch of a gray from 0 to 255 with a label below: uint8 RGB [44, 256, 3]."""
     return _bar(np.full((22, 256, 3), color, np.uint8), text)
 
 
 def _bar(colors: Picture, left: str, middle: str = "", right: str = "") -> Picture:
-    """Colors [22, 256, 3], and below them what stands at their two ends and between."""
+    """Draw colors [22, 256, 3] with labels below at the left, in the middle, and at the right."""
     image = Image.new("RGB", (256, 44), "white")
     image.paste(Image.fromarray(colors))
     font = ImageFont.load_default(16)
@@ -343,14 +349,14 @@ def _bar(colors: Picture, left: str, middle: str = "", right: str = "") -> Pictu
 def write_png(
     path: str | Path, rgb8: Picture, alpha8: Picture | None = None, about: Mapping[str, str] = NOTHING
 ) -> None:
-    """Write a uint8 RGB [H, W, 3] picture in one step: a reader sees the old file or the whole new one.
+    """Write a uint8 RGB [H, W, 3] picture atomically.
 
     Args:
-        path: path of the file. rgb8: the picture. alpha8: [H, W] uint8 how opaque it is; None: wholly.
-        about: texts in ASCII by keyword, which go into the file.
+        path: path of the file. rgb8: the picture. alpha8: [H, W] uint8 opacity; None for opaque.
+        about: metadata of the file, ASCII texts by keyword.
 
     Raises:
-        ValueError: not such a picture.
+        ValueError: the array is not a picture.
         PolarguideError: the file cannot be written.
     """
     check_picture(rgb8, "picture")
@@ -379,3 +385,166 @@ def color_gradient(color_map: str) -> str:
     levels = np.linspace(0, 255, 9).round().astype(np.uint8)[None]
     colors = cv2.applyColorMap(levels, COLOR_MAPS[color_map])[0, :, ::-1]
     return ", ".join(f"rgb({r} {g} {b})" for r, g, b in colors.tolist())
+
+
+RADIANCE = frozenset(("final", "base", "reflection", "specular", "diffuse"))
+"""Layers that are linear radiance."""
+
+
+DOLP_HIGH = 0.5
+"""DoLP of full brightness. Dielectrics exceed it near Brewster's angle only."""
+AOLP_FULL_DOLP = 0.1
+"""DoLP above which the AoLP has full brightness. Below it, noise dominates the angle."""
+STOKES_HIGH = 0.5
+"""S1 / S0 and S2 / S0 of full color."""
+_SHARES = ("strength", "roughness", "metalness", "alpha")
+Depths = tuple[float, float]
+"""Nearest and farthest depth of a color scale."""
+
+
+def layer_picture(
+    result: RenderResult,
+    name: str,
+    camera: Camera,
+    depths: Depths | None = None,
+    *,
+    exposed: bool = False,
+    color: Tensor | None = None,
+) -> Picture | None:
+    """Return a layer as an 8-bit picture, or None if the recipe lacks it.
+
+    Args:
+        result, camera: the rendering.
+        name: name of the layer.
+        depths: range of the colors of depth.
+        exposed: darken radiance so that at most 1 % of the pixels clip.
+        color: color matrix of the presentation, [3, 3], for layers of radiance.
+    """
+    if name in POLARIZED:
+        return polarization_picture(name, result.layers["stokes"]) if "stokes" in result.layers else None
+    values = result.layers.get(name)
+    if values is None:
+        return None
+    if name in RADIANCE:
+        values = colored(values, color)
+    if exposed:
+        values = values * clipping_exposure(values)
+    if name == "depth":
+        there = result.alpha > 0.5
+        return depth_picture(torch.where(there, values, 0.0), depths or depth_range(values, there))
+    if name == "normal":
+        return normal_to_rgb(values, camera)
+    return scalar_to_rgb(values, 0.0, 1.0) if name in _SHARES else radiance_to_rgb(values)
+
+
+def polarization_picture(name: str, stokes: Tensor) -> Picture:
+    """Return Stokes vectors [3, H, W, C], predicted or measured, as one of ``POLARIZED``, by their luminance.
+
+    ``stokes``: S1 / S0 in red and S2 / S0 in green, mid gray at 0.
+    """
+    gray = optics.luminance(stokes)
+    degree = optics.dolp(gray)
+    if name == "dolp":
+        return dolp_to_rgb(degree, DOLP_HIGH)
+    if name == "aolp":
+        return aolp_to_rgb(optics.aolp(gray), degree / AOLP_FULL_DOLP)
+    shares = gray[1:] / gray[0].clamp(min=1e-6)
+    red, green = (0.5 + shares / (2 * STOKES_HIGH)).unbind(0)
+    return shares_to_rgb(torch.stack((red, green, torch.full_like(red, 0.5)), dim=-1))
+
+
+def depth_picture(depth: Tensor, depths: Depths) -> Picture:
+    """Return depths [H, W] in colors on a logarithmic scale; black without a depth."""
+    near, far = (math.log(end) for end in depths)
+    logs = torch.where(depth > 0, depth.double().clamp(min=1e-12).log(), math.nan)
+    return scalar_to_rgb(logs, near, far)
+
+
+def layer_scale(name: str, depths: Depths | None = None) -> Picture | None:
+    """Return the legend of a layer, 256 pixels wide, or None for radiance, and for depth without a range."""
+    name = name.partition(",")[0]
+    if name in _SHARES:
+        return scale_bar(0.0, 1.0, "viridis")
+    if name == "depth" and depths is not None:
+        near, far = (float(f"{end:.3g}") for end in depths)
+        return scale_bar(near, far, "viridis", "units", middle=f"{math.sqrt(near * far):.3g}")
+    if name == "dolp":
+        return scale_bar(0.0, DOLP_HIGH, "inferno")
+    if name == "stokes":
+        return color_patch(128, f"0; red S1, green S2, to {STOKES_HIGH:g} S0")
+    if name == "aolp":
+        return angle_wheel()
+    return normal_ball() if name == "normal" else None
+
+
+def clipping_exposure(values: Tensor) -> float:
+    """Return the factor, at most 1, with which under 1 % of the pixels of radiance [H, W, 3] exceed 1."""
+    brightest = values.detach().nan_to_num(0.0, 0.0, 0.0).amax(dim=-1).flatten().sort().values
+    limit = float(brightest[max(0, brightest.numel() - 1 - brightest.numel() // 128)])
+    return min(1.0, 1.0 / limit) if limit > 0 else 1.0
+
+
+_SAMPLES = 1_000_000
+"""Largest number of depths to sort. PyTorch accepts at most 16 million."""
+
+
+def depth_range(depth: Tensor, mask: Tensor) -> Depths:
+    """Return the range of depths where ``mask``, of one shape, without 2 % on either side."""
+    values = depth[mask & (depth > 0)]
+    if values.numel() == 0:
+        return 1.0, 2.0
+    values = values[:: max(1, values.numel() // _SAMPLES)]
+    near = max(float(values.quantile(0.02)), 1e-6)
+    return near, max(float(values.quantile(0.98)), 1.001 * near)
+
+
+def true_depths(view: View) -> Tensor | None:
+    """Return the true depths of a view's surfaces, 0 without a surface; None: unknown."""
+    truth = view.ground_truth
+    return None if truth is None or truth.depth is None else truth.depth
+
+
+def true_name(name: str) -> str:
+    """Return the name of a layer's ground truth: the photograph for the final layer."""
+    return "photograph" if name == "final" else f"{name}, true"
+
+
+def reference_pictures(
+    view: View, color: Tensor | None = None, depths: Depths | None = None
+) -> dict[str, Picture]:
+    """Return reference pictures of a view's layers, 8-bit.
+
+    They are the ``photograph``, the ground truth of other layers as ``NAME, true``, and the measured
+    polarization as ``NAME, measured``.
+
+    Args:
+        color, depths: see ``layer_picture``.
+    """
+    pictures = {
+        true_name(name): picture for name, picture in ground_truth_pictures(view, color, depths).items()
+    }
+    if view.is_determined:
+        stokes = view.stokes()
+        pictures |= {f"{name}, measured": polarization_picture(name, stokes) for name in POLARIZED}
+    return pictures
+
+
+def ground_truth_pictures(
+    view: View, color: Tensor | None = None, depths: Depths | None = None
+) -> dict[str, Picture]:
+    """Return the photograph as ``final`` and the ground truth of other layers as 8-bit pictures.
+
+    Depth needs ``depths``.
+    """
+    pictures = {"final": radiance_to_rgb(colored(view.photograph(), color))}
+    ground_truth = view.ground_truth
+    if ground_truth is None:
+        return pictures
+    if ground_truth.normal is not None:
+        pictures["normal"] = normal_to_rgb(ground_truth.normal, view.camera)
+    for name, layer in (("specular", ground_truth.specular), ("diffuse", ground_truth.diffuse)):
+        if layer is not None:
+            pictures[name] = radiance_to_rgb(colored(layer / 2, color))
+    if ground_truth.depth is not None and depths is not None:
+        pictures["depth"] = depth_picture(ground_truth.depth, depths)
+    return pictures

@@ -1,6 +1,6 @@
-"""Pages and files from the templates in the folders ``page`` of this package: HTML that asks for nothing outside.
+"""Self-contained HTML pages and SVG files from the templates in the ``page`` folders of packages.
 
-Their pictures are data URIs that fit a limit of size.
+Their pictures are data URIs with a limited size.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from PIL import Image
 from polarguide.visualization.figures import Picture, check_picture
 
 BASE = "polarguide.visualization"
-"""Its folder ``page`` has what all pages share: ``base.html`` with the head, and ``chart.svg``."""
+"""Package whose folder ``page`` has the common templates ``base.html`` and ``chart.svg``."""
 
 
 @lru_cache
 def templates(package: str) -> Environment:
-    """The templates of a package's folder ``page``, and those that all share; texts in HTML and SVG are escaped."""
+    """Return the templates of a package's folder ``page`` and the common ones. Texts in HTML and SVG are escaped."""
     environment = Environment(
         loader=ChoiceLoader([PackageLoader(package, "page"), PackageLoader(BASE, "page")]),
         autoescape=select_autoescape(["html", "svg"]),
@@ -38,19 +38,19 @@ def templates(package: str) -> Environment:
 
 
 def page_part(package: str, name: str) -> str:
-    """The text of a file in a package's folder ``page``, unchanged."""
+    """Return the text of a file in a package's folder ``page``."""
     loader = templates(package).loader
     assert loader is not None
     return loader.get_source(templates(package), name)[0]
 
 
 def page(package: str, name: str, *, script: str = "", more: str = "", **values: Any) -> str:
-    """An HTML page of a template that extends ``base.html``.
+    """Render an HTML page from a template that extends ``base.html``.
 
     Args:
-        package, name: the template. script: all that stands between the page's script tags; empty: no script may run.
-        more: what else may run, beside the script; further directives after a semicolon.
-        values: what the template names; ``title`` at least.
+        package, name: the template. script: content of the page's script element; empty forbids scripts.
+        more: additional sources of scripts; further directives follow a semicolon.
+        values: values of the template, at least ``title``.
     """
     return (
         templates(package)
@@ -60,17 +60,17 @@ def page(package: str, name: str, *, script: str = "", more: str = "", **values:
 
 
 def script_json(data: Any) -> str:
-    """JSON that cannot end the script element that holds it."""
+    """Return JSON that cannot end its script element."""
     text = json.dumps(data, allow_nan=False)
     return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 
 
 def content_policy(script: str = "", *, more: str = "") -> str:
-    """The policy of a page that asks for nothing: pictures within it, its styles, and this one script may be used.
+    """Return the content policy of a page without requests: it allows inline pictures, styles and one script.
 
     Args:
-        script: all that stands between the page's script tags; empty: no script may run.
-        more: what else may run, beside the script; further directives after a semicolon.
+        script: content of the page's script element; empty forbids scripts.
+        more: additional sources of scripts; further directives follow a semicolon.
     """
     allowed = ""
     if script:
@@ -88,13 +88,13 @@ LAYERS: dict[str, str] = {
     "normal_error": "normal error",
     "metalness": "metalness",
 }
-"""Layers of the report, in order: key and label."""
+"""Layers of the report in order: key and label."""
 LOSSLESS = ("normal",)
 JPEG_QUALITY = 90
 
 
 def data_uri(picture: Picture, layer: str, side: int) -> str:
-    """A picture uint8 RGB [H, W, 3] as a data URI, its longer side at most ``side`` pixels."""
+    """Return a picture uint8 RGB [H, W, 3] as a data URI, reduced to ``side`` pixels at its longer side."""
     check_picture(picture, layer)
     factor = min(1.0, side / max(picture.shape[:2]))
     size = [max(1, round(factor * length)) for length in (picture.shape[1], picture.shape[0])]

@@ -1,8 +1,12 @@
-"""Runs of a field: training, resuming and opening. They have no viewer, no export and no page."""
+"""Runs of a field: training, resuming and opening. They have no viewer, no export and no page.
+
+The memory of a field's training, planned from the headers of the scene's files.
+"""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from functools import cached_property
@@ -21,7 +25,7 @@ from polarguide.raster import choose_backend, use_threads
 from polarguide.results.rendering.mesh import RESOLUTION, Surface
 from polarguide.runs.callbacks import Ends, run_to_the_end
 from polarguide.runs.folder import CHECKPOINT, RunConfiguration, checkpoint_tensors, writing_to
-from polarguide.runs.memory_plan import pixels_of
+from polarguide.runs.memory_plan import PROCESS, MemoryPlan, pixels_of, share_memory
 from polarguide.runs.opened import read_scene, trained_scene
 from polarguide.runs.train import (
     check_same_run,
@@ -33,11 +37,36 @@ from polarguide.runs.train import (
 )
 from polarguide.training.settings import ResolvedSettings, TrainSettings
 from polarguide_bench.gnerp.loop import FieldLoop
-from polarguide_bench.gnerp.memory import plan_field_memory
-from polarguide_bench.gnerp.model import FieldModel
+from polarguide_bench.gnerp.model import FieldModel, implicit_surface
 from polarguide_bench.gnerp.recipe import NeuralRecipe
 from polarguide_bench.gnerp.state import FieldState
-from polarguide_bench.gnerp.surface import implicit_surface
+
+FIELD_COPIES = 5
+"""Copies of the parameters of a field: values, gradients, two moments, and those in the file that is written."""
+SAMPLE = 14_000
+"""Bytes of a sample of a step."""
+READ_VIEW = 60
+"""Bytes of a pixel of the view of a step."""
+TARGET_KEPT = 10
+"""Bytes of a pixel of what is kept of each view."""
+
+
+def plan_field_memory(
+    pixels: Sequence[int], recipe: NeuralRecipe, *, limit: float | None, in_memory: bool = False
+) -> MemoryPlan:
+    """Share out memory between the step of a field's training and its views.
+
+    Args:
+        pixels: pixels of each view as it is trained on. recipe: the method.
+        limit: GiB that the process may take; None: four fifths of what is free.
+        in_memory: whether the pictures are in memory already.
+
+    Raises:
+        PolarguideError: a limit that was given is too small.
+    """
+    largest = max(pixels, default=0)
+    own = PROCESS + 4 * recipe.numbers * FIELD_COPIES + SAMPLE * recipe.sampling.samples + READ_VIEW * largest
+    return share_memory(pixels, own, TARGET_KEPT, limit, in_memory, "", "")
 
 
 @dataclass(frozen=True, eq=False)

@@ -196,7 +196,7 @@ class _Watch:
         late = age >= self._options.patience
         if shot.fault is not None:  # names may still change, and a file that is too many may go
             return late
-        if shot.kind == "set" and not late and not shot.whole:  # more angles may come
+        if shot.kind == "set" and not late and not shot.complete:  # more angles may come
             return False
         if shot.kind == "filter" and len(shot.files) < len(ANGLES):
             if late and not state.reported:

@@ -26,10 +26,16 @@ from polarguide.training.settings import TrainSettings
 from polarguide_bench.gnerp.field import NetworkField
 from polarguide_bench.gnerp.loop import FieldLoop, aolp_loss, color_loss, eikonal_loss, guidance_loss
 from polarguide_bench.gnerp.march import _strata
-from polarguide_bench.gnerp.memory import plan_field_memory
 from polarguide_bench.gnerp.model import FieldModel
 from polarguide_bench.gnerp.recipe import FieldShape, NeuralRecipe, Sampling
-from polarguide_bench.gnerp.runs import FieldRun, load_field, open_field, resolve_field, train_field
+from polarguide_bench.gnerp.runs import (
+    FieldRun,
+    load_field,
+    open_field,
+    plan_field_memory,
+    resolve_field,
+    train_field,
+)
 from polarguide_bench.gnerp.state import FieldState
 from polarguide_bench.plan import trained_steps
 from polarguide_bench.recipes import ABLATIONS_GNERP, RECIPE_GNERP

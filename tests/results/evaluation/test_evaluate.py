@@ -56,9 +56,9 @@ def test_what_scores_do_not_mean_is_said(changed: tuple[Path, Path]) -> None:
     heard = Heard()
     record = opened(folder, scene, heard).evaluate(reporter=heard)
     said = "\n".join(heard.said)
-    assert "The ground truth gives masks of 3, normals of 3 of 4 test views" in said
-    assert "Only 3 of 4 test views have a mask (not v022): stokes_error is over whole pictures." in said
-    assert "scene.json (objects) does not list 3, which gt/v000.npz shows" in said.replace("\\", "/")
+    assert "masks of 3, normals of 3 of 4 test views" in said
+    assert "3 of 4 test views have a mask (not v022)" in said
+    assert "scene.json (objects) does not list 3" in said.replace("\\", "/")
     assert "sphere_red" not in record["objects"]
     assert record["views"]["v022"]["normal_mae_deg"] is None
     assert record["views"]["v022"]["stokes_error"] is not None
@@ -88,8 +88,8 @@ def test_a_scene_without_ground_truth_has_its_stokes_error(changed: tuple[Path, 
     ("peaks", "expected"),
     [
         ([500.0, 700.0], (700.0, None)),
-        ([500.0, 500.0], (None, "the process had held more memory before it scored")),
-        ([None, None], (None, "the system does not tell")),
+        ([500.0, 500.0], (None, "the process used more memory before scoring")),
+        ([None, None], (None, "the operating system does not report it")),
     ],
 )
 def test_peak_memory_is_that_of_scoring(
@@ -117,7 +117,7 @@ def test_a_run_without_test_views_is_not_scored(changed: tuple[Path, Path]) -> N
     about = json.loads((folder / "run.json").read_text())
     (folder / "run.json").write_text(json.dumps({**about, "test_views": []}))
     (folder / "metrics.json").unlink(missing_ok=True)
-    Fault(expected="test views", found="none").raised_by(opened(folder, scene, Heard()).evaluate)
+    Fault(expected="test view", found="none").raised_by(opened(folder, scene, Heard()).evaluate)
     assert not (folder / "metrics.json").exists()
 
 

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import torch
 from faults import Fault
+from heard import Heard
 from plyfile import PlyData
 from random_runs import random_state, ring
 
@@ -232,5 +233,10 @@ def test_without_masks_it_is_what_most_cameras_look_at() -> None:
     places = frame.center + torch.tensor([[0.0], [0.2], [1.0], [3.0]]) * frame.distance * across
     assert subject.holds(places).tolist() == [True, True, False, False]
     opened.folder = Path("my run")
-    assert "polarguide present 'my run' --crop all" in subject.told(2, 4, opened)
-    assert subject.told(4, 4, opened) == ""
+    heard = Heard()
+    subject.report_removed(torch.tensor([True, True, True]), opened, heard)
+    assert heard.said == []
+    subject.report_removed(torch.tensor([True, False, True]), opened, heard)
+    (line,) = heard.said
+    assert line.startswith("2 of 3 Gaussians")
+    assert "polarguide present 'my run' --crop all" in line

@@ -17,7 +17,7 @@ from polarguide.capture.presentation import Presentation
 from polarguide.gaussians.harmonics import evaluate_sh
 from polarguide.results.export import web_page
 from polarguide.results.export.adapters import page_shading
-from polarguide.results.export.share import BAKED, baked_page, harmonics_steps, records, share_page
+from polarguide.results.export.web_page import BAKED, baked_page, harmonics_steps, records, share_page
 from polarguide.runs.model import gaussian_colors
 from polarguide.shading.deferred import DeferredShading
 from polarguide.shading.model import PLAIN, Light, Parameters

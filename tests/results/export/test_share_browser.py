@@ -22,12 +22,12 @@ from polarguide.core.files import write_text
 from polarguide.geometry.camera import Camera
 from polarguide.raster.cpu import rasterize_cpu
 from polarguide.raster.magnification import footprints
-from polarguide.results.export.share import share_page
+from polarguide.results.export.web_page import share_page
 from polarguide.shading.gbuffer import render
 from polarguide.shading.model import ShadingModel
 from polarguide.shading.result import RenderResult
 from polarguide.training.state import TrainingState
-from polarguide.visualization.layers import layer_picture
+from polarguide.visualization.figures import layer_picture
 
 pytestmark = pytest.mark.slow
 CHART = Chart(((1.2, -0.3, 0.1), (-0.2, 1.1, 0.1), (0.1, -0.4, 1.5)), 1.0, 2.0, 24, "v0")
@@ -191,7 +191,7 @@ def test_layer_buttons_and_keys(fresh: Opened) -> None:
 def test_a_layer_is_explained_and_the_hint_goes_when_it_was_followed(fresh: Opened) -> None:
     fresh.page.click("button[data-layer=roughness]")
     said = [fresh.page.inner_text(f"#{part}") for part in ("sentence", "low", "high")]
-    assert said == ["roughness: how blurred mirror images are", "mirror", "matte"]
+    assert said == ["roughness: the blur of mirror images", "mirror", "matte"]
     fresh.page.click("#compare")
     assert [fresh.page.inner_text(f"#{side}") for side in ("left", "right")] == ["without gloss", "roughness"]
     fresh.page.click("#reset")

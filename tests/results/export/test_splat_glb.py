@@ -19,7 +19,7 @@ from polarguide.core.options import ModelOptions
 from polarguide.gaussians.harmonics import SH_C0
 from polarguide.gaussians.ply import read_ply
 from polarguide.optics.color import srgb_decode_array
-from polarguide.results.export.splat_glb import COLOR_SPACES, EXTENSION, write_splat_glb
+from polarguide.results.export.splats import COLOR_SPACES, EXTENSION, write_splat_glb
 from polarguide.runs.model import write_run_ply
 
 MODULES = Path(os.environ.get("NODE_PATH", Path(__file__).resolve().parents[3] / "build/node/node_modules"))

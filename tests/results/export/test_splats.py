@@ -34,6 +34,7 @@ from polarguide.results.export.placement import (
 )
 from polarguide.results.export.splats import _half_turned, write_sog, write_spz
 from polarguide.runs.model import gaussian_colors, write_run_ply
+from polarguide.shading.gbuffer import single_colors
 
 COUNT = 7
 FIELDS = {
@@ -62,7 +63,7 @@ def test_a_directional_gaussian_shows_its_albedo_and_the_light_in_its_mirror() -
     shape = (gaussians[name] for name in ("means", "quaternions", "log_scales"))
     normals = shortest_axis_normals(*shape, torch.zeros(3))
     facing = torch.where(normals @ ray[0][:, None] > 0, -normals, normals)
-    linear = shading.colors(gaussians, state.light, ray.expand(COUNT, 3), facing)
+    linear = single_colors(gaussians, state.light, shading, ray.expand(COUNT, 3), facing)
     found = gaussian_colors(state.gaussians, state.light, shading, ray)[:, 0]
     torch.testing.assert_close(found, linear.detach())
 
@@ -275,7 +276,8 @@ def test_the_same_picture_from_the_same_place(presentation: Presentation, tmp_pa
     state, shading = random_state("polarguide-stokes")
     whole, moved, placement = tmp_path / "whole.ply", tmp_path / "moved.ply", placed(presentation)
     write_run_ply(whole, state, shading, own_fields=ply_fields(shading, state.gaussians))
-    rewrite_splats(moved, whole, placement, None, [])
+    everything = torch.ones(len(read_ply(whole)["means"]), dtype=torch.bool)
+    rewrite_splats(moved, whole, placement, everything, [])
     camera = CAMERAS["v2"]
     for field in ("", "linear"):
         before, after = picture(whole, camera, field), picture(moved, placement.camera(camera), field)

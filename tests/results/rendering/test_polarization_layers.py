@@ -68,7 +68,7 @@ def test_the_sheet_has_both_names_a_scale_each_and_no_empty_column(
     assert columns[-6:] == ["depth", "depth, true", "dolp", "dolp, measured", "aolp", "aolp, measured"]
     assert [cell is None for cell in footer] == [name in ("final", "photograph") for name in columns]
     assert "metalness" not in columns
-    assert caption.endswith("left out, the same everywhere: metalness")
+    assert caption.endswith("left out as uniform: metalness")
 
 
 def test_depths_have_many_colors_near_and_far(run: polarguide.Run, tmp_path: Path) -> None:

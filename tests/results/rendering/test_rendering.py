@@ -249,7 +249,7 @@ def test_an_encoder_that_ends_on_a_full_disk_is_noticed(
             Path(name).write_bytes(whole[: int(share * len(whole))])
 
     monkeypatch.setattr(encoder, "write_frames", cut)
-    Fault("a.mp4", "", "of 5 pictures", "room").raised_by(
+    Fault("a.mp4", "", "of 5 pictures", "space").raised_by(
         write_video, tmp_path / "a.mp4", PICTURES, frames_per_second=10
     )
     assert [path.name for path in tmp_path.iterdir()] == ["a.mp4"]

@@ -229,7 +229,9 @@ def test_a_table_that_goes_away_takes_no_more_lines(tmp_path: Path, how: str) ->
 
 
 def test_no_table_among_the_shots(folder: Path, reading: ShotOptions) -> None:
-    Fault(found="that of the shots").raised_by(measure_shots, [folder], folder, MeasureOptions(), reading)
+    Fault(found="the folder of the shots").raised_by(
+        measure_shots, [folder], folder, MeasureOptions(), reading
+    )
     assert not (folder / LINES).exists()
 
 

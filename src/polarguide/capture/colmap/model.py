@@ -1,4 +1,4 @@
-"""The files of a COLMAP model: checked before they are read, and written for posed cameras without points."""
+"""Read, check and write the files of a COLMAP model."""
 
 from __future__ import annotations
 
@@ -30,19 +30,19 @@ MODELS = {
     "OPENCV_FISHEYE": (5, 8), "FULL_OPENCV": (6, 12), "FOV": (7, 5), "SIMPLE_RADIAL_FISHEYE": (8, 4),
     "RADIAL_FISHEYE": (9, 5), "THIN_PRISM_FISHEYE": (10, 12),
 }  # fmt: skip
-"""COLMAP's camera models: number and count of parameters."""
+"""Id and number of parameters of COLMAP's camera models by name."""
 
 
 @dataclass(frozen=True, eq=False)
 class PosedCamera:
-    """Intrinsics and pose of one picture, in COLMAP's conventions.
+    """Intrinsics and pose of one picture in COLMAP's conventions.
 
     Attributes:
         width, height: picture size in pixels.
-        model: a key of ``MODELS``.
-        parameters: in COLMAP's order; pixel centers at 0.5.
-        rotation: world to camera, [3, 3].
-        translation: world to camera, [3].
+        model: camera model, a key of ``MODELS``.
+        parameters: parameters of the model; pixel centers are at 0.5.
+        rotation: rotation from world to camera, [3, 3].
+        translation: translation from world to camera, [3].
     """
 
     width: int
@@ -54,17 +54,17 @@ class PosedCamera:
 
     @property
     def intrinsics(self) -> tuple[Any, ...]:
-        """Model, size and parameters: equal for pictures of one camera."""
+        """Model, size and parameters; equal for pictures of one camera."""
         return (self.model, self.width, self.height, *self.parameters)
 
     @property
     def center(self) -> NDArray[np.float64]:
-        """Camera center in the world, [3]."""
+        """Camera center in world coordinates, [3]."""
         return np.asarray(-self.rotation.T @ self.translation)
 
 
 def colmap_camera(camera: PosedCamera, **more: Any) -> pycolmap.Camera:
-    """The intrinsics of a camera as pycolmap's type."""
+    """Convert the intrinsics of a camera to pycolmap's type."""
     size = {"width": camera.width, "height": camera.height}
     return pycolmap.Camera(model=camera.model, params=list(camera.parameters), **size, **more)
 
@@ -72,25 +72,25 @@ def colmap_camera(camera: PosedCamera, **more: Any) -> pycolmap.Camera:
 def posed_model(
     cameras: Mapping[str, PosedCamera], numbers: Mapping[str, tuple[int, int]] | None = None
 ) -> pycolmap.Reconstruction:
-    """A COLMAP model with one image ``<view>.png`` a view and no points.
+    """Create a COLMAP model without points, with an image ``<view>.png`` for each view.
 
-    Views that share their intrinsics share a camera.
+    Views with equal intrinsics share a camera.
 
     Args:
-        cameras: by view name.
-        numbers: numbers of each view's image and camera; counted from 1 if None.
+        cameras: cameras by view name.
+        numbers: ids of each view's image and camera; default: counted from 1.
     """
     model = pycolmap.Reconstruction()
-    number_of: dict[tuple[object, ...], int] = {}
+    ids: dict[tuple[object, ...], int] = {}
     for number, (view, camera) in enumerate(sorted(cameras.items()), 1):
-        of_camera = number_of.setdefault(camera.intrinsics, len(number_of) + 1)
+        camera_id = ids.setdefault(camera.intrinsics, len(ids) + 1)
         if numbers is not None:
-            number, of_camera = numbers[view]
-        if not model.exists_camera(of_camera):
-            model.add_camera_with_trivial_rig(colmap_camera(camera, camera_id=of_camera))
+            number, camera_id = numbers[view]
+        if not model.exists_camera(camera_id):
+            model.add_camera_with_trivial_rig(colmap_camera(camera, camera_id=camera_id))
         w, *axis = quaternion(camera.rotation)
         pose = pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([*axis, w])), camera.translation)
-        image = pycolmap.Image(name=f"{view}.png", camera_id=of_camera, image_id=number)
+        image = pycolmap.Image(name=f"{view}.png", camera_id=camera_id, image_id=number)
         model.add_image_with_trivial_frame(image, pose)
     return model
 
@@ -100,9 +100,13 @@ _LONGEST_NAME = 4096
 
 
 def check_model_files(folder: Path, kind: str) -> None:
-    """Check the files of a model, of suffix ``kind``; missing files are skipped.
+    """Check the files of a model before pycolmap reads them. Missing files are skipped.
 
-    pycolmap checks text files itself. Only decimal commas and the colors of points are searched for there.
+    pycolmap checks text files itself, except for decimal commas and the range of colors.
+
+    Args:
+        folder: folder of the model.
+        kind: suffix of the files, ".bin" or ".txt".
 
     Raises:
         PolarguideError: a file is truncated, damaged, or has trailing bytes.
@@ -124,7 +128,7 @@ def check_model_files(folder: Path, kind: str) -> None:
             try:
                 end = walk(data)
                 if end != len(data):
-                    found = f"{len(data)} bytes where its counts require {end}"
+                    found = f"{len(data)} bytes instead of the {end} that its counts require"
             except (struct.error, ValueError) as error:
                 found = f"a damaged one ({error})" if data else "an empty file"
         elif comma := _decimal_comma(data):
@@ -132,10 +136,10 @@ def check_model_files(folder: Path, kind: str) -> None:
                 path,
                 expected="numbers with a decimal point",
                 found=comma,
-                remedy="Write the model again in a program or a locale (LC_NUMERIC=C) that writes points.",
+                remedy="Write the model again with a locale that uses decimal points (LC_NUMERIC=C).",
             )
         elif name == "points3D":
-            found = _strange_color(data)
+            found = _invalid_color(data)
         if found is not None:
             raise PolarguideError(
                 path,
@@ -145,11 +149,12 @@ def check_model_files(folder: Path, kind: str) -> None:
             )
 
 
-_HEAD = 1 << 16  # bytes; a program writes all lines alike
+_HEAD = 1 << 16
+"""Number of bytes in which a decimal comma is searched; a program writes all lines alike."""
 
 
 def _decimal_comma(data: bytes) -> str:
-    """Where the first lines of a text file have a decimal comma; empty where they have none."""
+    """Describe the first decimal comma in the head of a text file, or return an empty text."""
     for number, line in enumerate(data[:_HEAD].decode("ascii", "replace").splitlines(), 1):
         comma = "" if line.startswith("#") else decimal_comma(line.split()[:_POSE])
         if comma:
@@ -157,10 +162,10 @@ def _decimal_comma(data: bytes) -> str:
     return ""
 
 
-def _strange_color(data: bytes) -> str | None:
-    """Return a line of ``points3D.txt`` with a color that pycolmap would take modulo 256, or None.
+def _invalid_color(data: bytes) -> str | None:
+    """Describe the first color in ``points3D.txt`` that is not in 0..255; None if all are.
 
-    Colors that are not numbers are left to pycolmap, which refuses them.
+    pycolmap takes such colors modulo 256. It refuses colors that are not numbers itself.
     """
     for number, line in enumerate(data.splitlines(), 1):
         cells = line.split(None, 7)[4:7]
@@ -168,94 +173,103 @@ def _strange_color(data: bytes) -> str | None:
             cell.lstrip(b"-").isdigit() and not (len(cell) <= 3 and 0 <= int(cell) <= 255) for cell in cells
         ):
             color = ", ".join(cell.decode("ascii", "replace")[:20] for cell in cells)
-            return f"a color of {color} in line {number}, whose parts go from 0 to 255"
+            return f"a color of {color} in line {number}, outside of 0 to 255"
     return None
 
 
 def _cameras(data: bytes) -> int:
+    """Return the end of the cameras in ``cameras.bin``."""
     (count,) = struct.unpack_from("<Q", data)
     at = 8
-    for _ in range(_at_most(count, len(data) // 48)):
+    for _ in range(_checked_count(count, len(data) // 48)):
         _, model, width, height = struct.unpack_from("<IiQQ", data, at)
         if not (0 < width < 1 << 20 and 0 < height < 1 << 20):
             raise ValueError(f"a camera of {width}x{height} pixels")
-        if model not in _PARAMETERS:  # a newer model: its length is not known here
+        if model not in _PARAMETERS:  # a newer model of unknown length
             return len(data)
         at += 24 + 8 * _PARAMETERS[model]
     return at
 
 
 def _lists(data: bytes, head: Callable[[bytes, int], int], counter: str, entry: int) -> int:
-    """The end of records that each have a head, a count, and as many entries of ``entry`` bytes.
+    """Return the end of records of a head, a count and as many entries.
 
-    ``head`` returns the end of the head at a place; ``counter`` is the type of the count, for ``struct``.
+    Args:
+        data: the whole file.
+        head: function that returns the end of the head at an offset.
+        counter: type of the count for ``struct``.
+        entry: size of an entry in bytes.
     """
     (count,) = struct.unpack_from("<Q", data)
     at = 8
-    for _ in range(_at_most(count, len(data) // 8)):
+    for _ in range(_checked_count(count, len(data) // 8)):
         at = head(data, at)
         (entries,) = struct.unpack_from(counter, data, at)
         at += struct.calcsize(counter)
-        at += entry * _at_most(entries, (len(data) - at) // entry)
+        at += entry * _checked_count(entries, (len(data) - at) // entry)
     return at
 
 
 def _image(data: bytes, at: int) -> int:
+    """Return the end of an image's pose and name at an offset of ``images.bin``."""
     if not all(map(math.isfinite, struct.unpack_from("<7d", data, at + 4))):
         raise ValueError("an image whose pose is not finite")
     name = data.find(b"\0", at + 64, at + 64 + _LONGEST_NAME)
     if name < 0:
-        raise ValueError("an image without the end of its name")
+        raise ValueError("an image whose name does not end")
     return name + 1
 
 
 def _rigs(data: bytes) -> int:
+    """Return the end of the rigs in ``rigs.bin``."""
     (count,) = struct.unpack_from("<Q", data)
     at = 8
-    for _ in range(_at_most(count, len(data) // 8)):
+    for _ in range(_checked_count(count, len(data) // 8)):
         _, sensors = struct.unpack_from("<II", data, at)
         at += 8
-        for sensor in range(_at_most(sensors, (len(data) - at) // 8)):
+        for sensor in range(_checked_count(sensors, (len(data) - at) // 8)):
             at += 8
-            if sensor:  # the first is the rig's own place
+            if sensor:  # the first sensor is the origin of the rig and has no pose
                 (has_pose,) = struct.unpack_from("<B", data, at)
                 at += 1 + 56 * bool(has_pose)
         if at > len(data):
-            raise ValueError("a rig without its end")
+            raise ValueError("a rig that does not end")
     return at
 
 
-def _at_most(count: int, most: int) -> int:
-    """The count, if the file is long enough for it."""
+def _checked_count(count: int, most: int) -> int:
+    """Return the count of a record; raise ValueError if it exceeds the length of the file."""
     if count > most:
-        raise ValueError(f"a count of {count} that the file is too short for")
+        raise ValueError(f"a count of {count}, too many for the length of the file")
     return count
 
 
 _NUMBER = re.compile(rb"[-+]?(?:(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?|nan|inf)", re.IGNORECASE)
-_POSE = 9  # number, quaternion, translation, camera: what stands before the name
-_PLACE = 3  # x, y and the number of a point; pycolmap checks all of them, lines of images show in the first
+_POSE = 9
+"""Number of values before the name of an image: id, quaternion, translation, camera."""
+_PLACE = 3
+"""Number of values of an observation: x, y and the id of a point. Only the first observation is parsed here."""
 
 
 def read_text_images(data: bytes) -> tuple[bytes, dict[int, str]]:
-    """Take the names out of an ``images.txt``, for pycolmap, which cuts them at blanks.
+    """Replace the image names in an ``images.txt`` by numbers. pycolmap cuts names at blanks.
 
-    An image with one line, as some programs write it, would make pycolmap pass over every other image.
+    The lines must alternate between images and observations. Otherwise pycolmap would skip every other image.
 
     Returns:
-        The same file with numbers for names, and the name of each image by its number.
+        The file with numbers as names, and the names by image id.
 
     Raises:
-        ValueError: lines are not those of images and their observations in turn, or a name is not in UTF-8.
+        ValueError: images and observations do not alternate, or a name is not UTF-8.
     """
     out: list[bytes] = []
     names: dict[int, str] = {}
-    number: int | None = None  # of the image whose observations come next
+    number: int | None = None  # image whose observations are in the next line
     for count, line in enumerate(data.splitlines(), 1):
         cells = line.split()
         if number is not None:
             if len(cells) % _PLACE or not all(map(_NUMBER.fullmatch, cells[: _POSE + _PLACE])):
-                raise ValueError(f"line {count} does not hold the observations of image {number}")
+                raise ValueError(f"line {count} has no observations of image {number}")
             number = None
             out.append(line)
         elif not cells or line.lstrip().startswith(b"#"):
@@ -263,10 +277,10 @@ def read_text_images(data: bytes) -> tuple[bytes, dict[int, str]]:
         else:
             head = line.split(None, _POSE)
             if len(head) <= _POSE or not (head[0].isdigit() and all(map(_NUMBER.fullmatch, head[:_POSE]))):
-                raise ValueError(f"line {count} does not hold an image")
+                raise ValueError(f"line {count} has no image")
             number = int(head[0])
             if number in names:
-                raise ValueError(f"image {number} stands there twice")
+                raise ValueError(f"image {number} occurs twice")
             try:
                 names[number] = head[_POSE].decode().strip()
             except UnicodeDecodeError:
@@ -276,8 +290,8 @@ def read_text_images(data: bytes) -> tuple[bytes, dict[int, str]]:
 
 
 MODEL_FILES = ("cameras", "images", "points3D", "rigs", "frames")
-# Perspective models that are a plain pinhole when all of their distortion parameters are zero.
 PINHOLES = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
+"""Perspective camera models. They are pinhole cameras if all of their distortion parameters are zero."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -285,11 +299,11 @@ class ColmapModel:
     """Poses, intrinsics and points of a COLMAP model.
 
     Attributes:
-        folder: the folder with its files.
-        files: the files that were read.
-        points: [M, 3] float32, in the order of their COLMAP ids.
-        point_colors: [M, 3] uint8.
-        warnings: plain sentences.
+        folder: folder of the files.
+        files: files that were read.
+        points: 3D points in the order of their ids, [M, 3] float32.
+        point_colors: colors of the points, [M, 3] uint8.
+        warnings: warnings for the user.
     """
 
     folder: Path
@@ -308,10 +322,10 @@ class ColmapModel:
         return sorted(self._images)
 
     def camera(self, view: str) -> Camera:
-        """Camera of the image whose name without folder and suffix is ``view``, at the size the model states.
+        """Return the camera of a view, at the size that the model states.
 
         Raises:
-            PolarguideError: there is no such image or more than one, it is distorted, or has broken numbers.
+            PolarguideError: the model has no image of this view or several, or its camera is distorted or invalid.
         """
         images = self._images.get(view, [])
         if len(images) != 1:
@@ -321,38 +335,36 @@ class ColmapModel:
                 expected=f"one posed image called {view} (any suffix)",
                 found=", ".join(sorted(image.name for image in images))
                 or f"none; the nearest are {', '.join(near)}",
-                remedy="Register the view in COLMAP under this name, or leave out its pictures.",
+                remedy="Register the view in COLMAP under this name, or remove its pictures.",
             )
         return _camera_of(self.folder, images[0], self._cameras[images[0].camera_id])
 
     def correspondences(self, view: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Where a view observes points, in pixels at the size the model states [N, 2], and the points [N, 3]."""
-        seen = [
+        """Return a view's observations in pixels, at the size that the model states [N, 2], and their points [N, 3]."""
+        pairs = [
             (point.xy, self._rows[point.point3D_id])
             for image in self._images.get(view, [])[:1]
             for point in image.points2D
             if point.has_point3D() and point.point3D_id in self._rows
         ]
-        pixels = np.array([place for place, _ in seen], np.float64).reshape(-1, 2)
-        return pixels, self.points.double().numpy()[[row for _, row in seen]]
+        pixels = np.array([place for place, _ in pairs], np.float64).reshape(-1, 2)
+        return pixels, self.points.double().numpy()[[row for _, row in pairs]]
 
     def observations(self, views: Sequence[str]) -> Tensor:
-        """Which of the views observe each point, [M, V] bool; all False where no tracks are stored."""
-        columns = {view: column for column, view in enumerate(views)}
-        by_id = {
-            image.image_id: columns[view]
-            for view, images in self._images.items()
-            if view in columns
-            for image in images
+        """Return a mask of the views that observe each point, [M, V]; all False for a model without tracks."""
+        columns = {
+            image.image_id: column
+            for column, view in enumerate(views)
+            for image in self._images.get(view, [])
         }
         observed = torch.zeros(len(self._tracks), len(views), dtype=torch.bool)
         for row, track in enumerate(self._tracks):
-            observed[row, [by_id[number] for number in track if number in by_id]] = True
+            observed[row, [columns[number] for number in track if number in columns]] = True
         return observed
 
 
 def read_model(root: Path) -> ColmapModel:
-    """Read the COLMAP model in ``root/sparse/0`` or ``root/sparse``: binary, else text.
+    """Read the COLMAP model in ``root/sparse/0`` or ``root/sparse``. Binary files take precedence over text.
 
     Raises:
         PolarguideError: there is no model, it cannot be read, or it has no points.
@@ -371,7 +383,7 @@ def read_model(root: Path) -> ColmapModel:
         found="none",
         remedy="Triangulate points with the known poses (colmap point_triangulator).",
     )
-    beyond = f"not finite, or farther than {FARTHEST:g}, and were left out."
+    beyond = f"not finite, or farther than {FARTHEST:g}, and were ignored."
     warning = f"{dropped} of {dropped + len(points)} 3D points are {beyond}"
     warnings = (*stale, *([warning] if dropped else []))
     rows = {number: row for row, number in enumerate(numbers)}
@@ -379,7 +391,7 @@ def read_model(root: Path) -> ColmapModel:
 
 
 def fit_camera(camera: Camera, width: int, height: int, *, folder: Path, view: str) -> Camera:
-    """The camera at the size of the pictures, rescaled where the model was made at another resolution.
+    """Scale a camera to the size of the pictures.
 
     Raises:
         PolarguideError: the two sizes differ by more than one common factor.
@@ -391,59 +403,66 @@ def fit_camera(camera: Camera, width: int, height: int, *, folder: Path, view: s
         f"{folder} (camera of view {view})",
         expected=f"the size of the pictures, {width}x{height}",
         found=f"{camera.width}x{camera.height}",
-        remedy="Give intrinsics for these pictures, or pictures of the size COLMAP saw (no crop).",
+        remedy="Use intrinsics of these pictures, or pictures of the size that COLMAP used (without a crop).",
     )
     return camera.scaled(width / camera.width, width, height)
 
 
 def unused_poses(model: ColmapModel, names: list[str]) -> list[str]:
-    """A warning about posed images without a view in the capture, if there are any."""
+    """Return a warning about posed images without a view in the capture, if there are any."""
     unused = sorted(set(model.names) - set(names))
     if not unused:
         return []
     return [f"The COLMAP model has poses for {len(unused)} images without pictures ({listed(unused)})."]
 
 
+def _model_files(root: Path, itself: bool = True) -> list[tuple[Path, str]]:
+    """List the folders and suffixes of the models in a folder, in order of precedence."""
+    folders = (root / "sparse" / "0", root / "sparse", *([root / "0", root] if itself else []))
+    return [
+        (folder, kind)
+        for folder in folders
+        for kind in (".bin", ".txt")
+        if (folder / f"cameras{kind}").exists()
+    ]
+
+
 def find_model(root: Path, *, itself: bool = True, points: bool = True) -> tuple[Path, str]:
-    """The folder of a model and the suffix of its files: in ``sparse/0`` or ``sparse``, else ``0`` or ``root`` itself.
+    """Find the folder and the suffix of a model in ``sparse/0``, ``sparse``, ``0`` or ``root`` itself.
 
     Args:
-        root: where to look.
-        itself: whether the files may be in ``root`` or ``root/0``.
-        points: whether the file of points is required.
+        root: folder to search.
+        itself: if True, the files may be in ``root`` or ``root/0``.
+        points: if True, the file of points is required.
 
     Raises:
-        PolarguideError: there is none, or a file of it is missing.
+        PolarguideError: there is no model, or one of its files is missing.
     """
-    needed = ("images", "points3D") if points else ("images",)
-    for folder in (root / "sparse" / "0", root / "sparse", *([root / "0", root] if itself else [])):
-        for kind in (".bin", ".txt"):
-            if (folder / ("cameras" + kind)).exists():
-                missing = [n for n in needed if not (folder / (n + kind)).exists()]
-                if missing:
-                    raise PolarguideError(
-                        folder / (missing[0] + kind),
-                        expected="this file of the COLMAP model",
-                        found="nothing",
-                        remedy=f"A model is cameras{kind}, images{kind} and points3D{kind} together.",
-                    )
-                return folder, kind
+    for folder, kind in _model_files(root, itself):
+        for name in ("images", "points3D") if points else ("images",):
+            require(
+                (folder / (name + kind)).exists(),
+                folder / (name + kind),
+                expected="this file of the COLMAP model",
+                found="nothing",
+                remedy=f"A model consists of cameras{kind}, images{kind} and points3D{kind}: copy all of them.",
+            )
+        return folder, kind
     raise PolarguideError(
         root if itself else root / "sparse" / "0",
         expected="a COLMAP model (cameras, images and points3D as .bin or .txt)",
-        found="neither there nor in sparse/",
-        remedy="Copy the model there; or let polarguide prepare FOLDER --out SCENE run structure from motion.",
+        found="no model in it or in sparse/",
+        remedy="Copy the model there, or run structure from motion with polarguide prepare FOLDER --out SCENE.",
     )
 
 
 def holds_model(root: Path) -> bool:
-    """Whether ``find_model`` finds a model, or a part of one, in a folder."""
-    places = (root / "sparse" / "0", root / "sparse", root / "0", root)
-    return any((folder / f"cameras{kind}").exists() for folder in places for kind in (".bin", ".txt"))
+    """Return True if a folder has a COLMAP model or a part of one."""
+    return bool(_model_files(root))
 
 
 def load_model(folder: Path, kind: str) -> Any:
-    """The model in a folder, as pycolmap's ``Reconstruction``; without points if it has no file of them.
+    """Read the model in a folder as pycolmap's ``Reconstruction``. The file of points may be missing.
 
     Raises:
         PolarguideError: pycolmap cannot read the model.
@@ -452,17 +471,17 @@ def load_model(folder: Path, kind: str) -> Any:
     check_model_files(folder, kind)
     try:
         if kind == ".bin":
-            with _whole(folder, kind) as whole:
-                model.read_binary(str(whole))
+            with _complete_files(folder, kind) as complete:
+                model.read_binary(str(complete))
         else:
             images, names = read_text_images(read_file(folder / "images.txt"))
-            with _whole(folder, kind, images) as whole:
-                model.read_text(str(whole))
+            with _complete_files(folder, kind, images) as complete:
+                model.read_text(str(complete))
             for number, image in model.images.items():
                 image.name = names[number]
     except PolarguideError:
         raise
-    except Exception as error:  # pycolmap raises whatever C++ threw: ValueError, IndexError, MemoryError, ...
+    except Exception as error:  # pycolmap raises several kinds of C++ errors
         raise PolarguideError(
             folder,
             expected="a readable COLMAP model",
@@ -472,33 +491,35 @@ def load_model(folder: Path, kind: str) -> Any:
     return model
 
 
-# Share by which numbers of two models may differ: programs write as few as six digits as text.
 _DIGITS = 1e-5
+"""Relative difference of equal numbers of two models; programs write as few as six digits as text."""
 
 
 def other_text_model(folder: Path, kind: str, model: Any) -> list[str]:
-    """The warning that text files beside a binary model say something else, if they do.
+    """Return a warning if text files next to a binary model have other content.
 
     Args:
-        folder: of the model. kind: suffix of the files that were read. model: what they hold.
+        folder: folder of the model.
+        kind: suffix of the files that were read.
+        model: content of these files.
     """
     if kind != ".bin" or not all((folder / f"{name}.txt").exists() for name in ("cameras", "images")):
         return []
     try:
         differ = _differing(model, load_model(folder, ".txt"))
     except PolarguideError as error:
-        return [f"The text model beside {folder / 'images.bin'} is not used, and cannot be read: {error}"]
+        return [f"The text model next to {folder / 'images.bin'} is ignored and cannot be read: {error}"]
     if not differ:
         return []
     return [
-        f"{folder} holds two models: images.txt has other poses or cameras than images.bin ({listed(differ)}). "
-        "The binary files are used; remove them if the text is right."
+        f"{folder} has two models: images.txt has other poses or cameras than images.bin ({listed(differ)}). "
+        "The binary files are used; remove them to use the text files."
     ]
 
 
 def _differing(model: Any, other: Any) -> list[str]:
-    """Names of the images that only one of two models has, or whose poses or cameras are others."""
-    placed, again = (
+    """Return the names of images that only one of two models has, or whose poses or cameras differ."""
+    first, second = (
         {
             image.name: (image.cam_from_world(), m.cameras[image.camera_id])
             for image in m.images.values()
@@ -506,41 +527,41 @@ def _differing(model: Any, other: Any) -> list[str]:
         }
         for m in (model, other)
     )
-    reach = max((float(np.abs(pose.translation).max()) for pose, _ in placed.values()), default=0.0)
+    reach = max((float(np.abs(pose.translation).max()) for pose, _ in first.values()), default=0.0)
 
     def alike(name: str) -> bool:
-        pose, camera = placed[name]
-        pose_again, camera_again = again[name]
+        pose, camera = first[name]
+        other_pose, other_camera = second[name]
         return (
-            camera.model_name == camera_again.model_name
-            and np.allclose(camera.params, camera_again.params, rtol=_DIGITS)
-            and np.allclose(pose.rotation.matrix(), pose_again.rotation.matrix(), rtol=0, atol=_DIGITS)
-            and np.allclose(pose.translation, pose_again.translation, rtol=0, atol=_DIGITS * reach)
+            camera.model_name == other_camera.model_name
+            and np.allclose(camera.params, other_camera.params, rtol=_DIGITS)
+            and np.allclose(pose.rotation.matrix(), other_pose.rotation.matrix(), rtol=0, atol=_DIGITS)
+            and np.allclose(pose.translation, other_pose.translation, rtol=0, atol=_DIGITS * reach)
         )
 
-    both = placed.keys() & again.keys()
-    return sorted((placed.keys() ^ again.keys()) | {name for name in both if not alike(name)})
+    both = first.keys() & second.keys()
+    return sorted((first.keys() ^ second.keys()) | {name for name in both if not alike(name)})
 
 
 @contextlib.contextmanager
-def _whole(folder: Path, kind: str, images: bytes | None = None) -> Iterator[Path]:
-    """The folder, or a copy: with an empty file of points where it has none, and with another file of images."""
+def _complete_files(folder: Path, kind: str, images: bytes | None = None) -> Iterator[Path]:
+    """Yield ``folder`` if it is complete, else a copy with an empty file of points or with ``images``."""
     if images is None and (folder / ("points3D" + kind)).exists():
         yield folder
         return
-    with tempfile.TemporaryDirectory() as made:
-        for name in MODEL_FILES:
-            if (folder / (name + kind)).exists():
-                shutil.copyfile(folder / (name + kind), Path(made) / (name + kind))
+    with tempfile.TemporaryDirectory() as name:
+        copy = Path(name)
+        (copy / f"points3D{kind}").write_bytes(bytes(8) if kind == ".bin" else b"")
+        for path in (folder / (name + kind) for name in MODEL_FILES):
+            if path.exists():
+                shutil.copyfile(path, copy / path.name)
         if images is not None:
-            (Path(made) / ("images" + kind)).write_bytes(images)
-        if not (folder / ("points3D" + kind)).exists():
-            (Path(made) / ("points3D" + kind)).write_bytes(bytes(8) if kind == ".bin" else b"")
-        yield Path(made)
+            (copy / f"images{kind}").write_bytes(images)
+        yield copy
 
 
 def posed_images(model: Any, views: Collection[str] = ()) -> dict[str, list[Any]]:
-    """The images with a pose of pycolmap's ``Reconstruction``, by the view that their name means."""
+    """Group the posed images of pycolmap's ``Reconstruction`` by the view of their name."""
     images: dict[str, list[Any]] = {}
     for number, image in model.images.items():
         if image.has_pose:
@@ -558,10 +579,10 @@ def posed_images(model: Any, views: Collection[str] = ()) -> dict[str, list[Any]
 
 
 def view_of_name(name: str, views: Collection[str] = ()) -> str:
-    """The view that a picture's name in a file of poses means: without folders, and without a suffix with a letter.
+    """Return the view of a picture's name in a pose file: the name without folders and suffix.
 
-    Suffixes without one are no kinds of files: ``./train/r_0.5`` is called so. Nor is what follows a point in the name
-    of one of ``views``: Metashape's labels have no suffix.
+    A suffix has a letter: ``./train/r_0.5`` has none. A name of ``views`` stays as it is, because labels of Metashape
+    have no suffix.
     """
     path = PurePosixPath(canonical(name).replace("\\", "/"))
     if path.name in views:
@@ -570,28 +591,29 @@ def view_of_name(name: str, views: Collection[str] = ()) -> str:
 
 
 def is_pinhole(camera: Any) -> bool:
-    """Whether a camera of pycolmap's is a pinhole without distortion."""
+    """Return True if a camera of pycolmap is a pinhole camera without distortion."""
     extra = camera.extra_params_idxs()
     return camera.model_name in PINHOLES and all(camera.params[index] == 0 for index in extra)
 
 
 def is_sound(image: Any, camera: Any, tolerance: float) -> bool:
-    """Whether pose and lens of pycolmap's image and camera have numbers that they can have, in single precision, too.
+    """Return True if pose and lens of pycolmap's image and camera are valid, also in single precision.
 
-    The quaternion needs length 1 to a tolerance; NaN is refused, and so are numbers beyond ``FARTHEST``.
+    Numbers must be finite and at most ``FARTHEST``. The quaternion must have length 1 within ``tolerance``.
     """
     pose = image.cam_from_world()
     quaternion = np.asarray(pose.rotation.quat, np.float64)
     translation = np.asarray(pose.translation)
-    turns = (np.abs(quaternion) <= 2).all() and abs(float(np.linalg.norm(quaternion)) - 1) <= tolerance
+    unit = (np.abs(quaternion) <= 2).all() and abs(float(np.linalg.norm(quaternion)) - 1) <= tolerance
     bounded = (np.abs(translation) <= FARTHEST).all() and (np.abs(camera.params) <= FARTHEST).all()
     if not len(camera.focal_length_idxs()):  # a panorama
         return False
     inner = (camera.params[list(k)] for k in (camera.focal_length_idxs(), camera.principal_point_idxs()))
-    return bool(turns and bounded) and can_be_lens((camera.width, camera.height), *inner)
+    return bool(unit and bounded) and can_be_lens((camera.width, camera.height), *inner)
 
 
 def _camera_of(folder: Path, image: Any, camera: Any) -> Camera:
+    """Convert pycolmap's image and camera to a ``Camera``."""
     where = f"{folder} (camera {camera.camera_id}, image {image.name})"
     if not is_pinhole(camera):
         raise PolarguideError(
@@ -600,61 +622,61 @@ def _camera_of(folder: Path, image: Any, camera: Any) -> Camera:
             found=f"{camera.model_name} with parameters {', '.join(f'{value:g}' for value in camera.params)}",
             remedy="Undistort the four intensities of each view, and the model with them.",
         )
-    placed = image.cam_from_world()
+    pose = image.cam_from_world()
     inner = (camera.focal_length_x, camera.focal_length_y, camera.principal_point_x, camera.principal_point_y)
     if not is_sound(image, camera, 1e-6):
         raise PolarguideError(
             where,
             expected=f"a unit quaternion, a translation up to {FARTHEST:g} and {LENS}",
-            found=f"quaternion {placed.rotation.quat}, translation {placed.translation}, intrinsics {inner}",
+            found=f"quaternion {pose.rotation.quat}, translation {pose.translation}, intrinsics {inner}",
             remedy="Export the model again.",
         )
     rotation, translation = (
-        torch.from_numpy(np.array(part, np.float64))
-        for part in (placed.rotation.matrix(), placed.translation)
+        torch.from_numpy(np.array(part, np.float64)) for part in (pose.rotation.matrix(), pose.translation)
     )
     fx, fy, cx, cy = map(float, inner)
     return Camera(int(camera.width), int(camera.height), fx, fy, cx, cy, rotation, translation)
 
 
 def _points_of(model: Any) -> tuple[Tensor, Tensor, tuple[tuple[int, ...], ...], list[int]]:
-    """Finite points, their colors, the numbers of the images that see them, and their own numbers."""
+    """Return finite points, their colors, the ids of the images that observe them, and their ids."""
     numbered = sorted(model.points3D.items())
     points = [point for _, point in numbered]
     with np.errstate(over="ignore"):
         places = np.array([point.xyz for point in points]).reshape(-1, 3).astype(np.float32)
     colors = np.array([point.color for point in points], dtype=np.uint8).reshape(-1, 3)
     finite = (np.abs(places) <= FARTHEST).all(axis=1)
-    seen = {number: {element.image_id for element in point.track.elements} for number, point in numbered}
-    for number, image in model.images.items():  # exported models may have tracks there alone
-        for observed in image.points2D:
-            if observed.has_point3D() and observed.point3D_id in seen:
-                seen[observed.point3D_id].add(number)
-    kept = [numbered[place][0] for place in np.flatnonzero(finite)]
-    tracks = tuple(tuple(sorted(seen[number])) for number in kept)
-    return torch.from_numpy(places[finite]), torch.from_numpy(colors[finite]), tracks, kept
+    observers = {number: {element.image_id for element in point.track.elements} for number, point in numbered}
+    for number, image in model.images.items():  # some models store tracks only in their images
+        for observation in image.points2D:
+            if observation.has_point3D() and observation.point3D_id in observers:
+                observers[observation.point3D_id].add(number)
+    ids = [numbered[place][0] for place in np.flatnonzero(finite)]
+    tracks = tuple(tuple(sorted(observers[number])) for number in ids)
+    return torch.from_numpy(places[finite]), torch.from_numpy(colors[finite]), tracks, ids
 
 
 _SAMPLES = 2000
-# Of a picture's sides, by which a point may miss it: pictures of few points need not show one.
+"""Number of points that are tested for visibility."""
 _MARGIN = 1.0
+"""Margin around a picture in its own sizes. In pictures of few points, no point may be inside."""
 
 
 def unseen_points(points: Tensor, cameras: Sequence[Camera]) -> list[str]:
-    """The warning that no camera has points [M, 3] before it; only some thousands of many points are looked at."""
+    """Return a warning if no camera has one of the points [M, 3] in front of it. Large clouds are sampled."""
     if not cameras or not len(points):
         return []
     places = points[:: max(1, len(points) // _SAMPLES)].to(torch.float64)
     if any(_sees(camera, places) for camera in cameras):
         return []
     return [
-        f"None of the {len(points)} points of the COLMAP model lies where one of the {len(cameras)} cameras looks: "
-        "points and poses are not of one model, or one of them is turned."
+        f"None of the {len(points)} points of the COLMAP model is in the field of view of one of the {len(cameras)} "
+        "cameras: points and poses are of different models, or one of them is rotated."
     ]
 
 
 def _sees(camera: Camera, places: Tensor) -> bool:
-    """Whether a point lies before a camera, in its picture or beside it."""
+    """Return True if a point is in front of a camera, in its picture or the margin around it."""
     local = places @ camera.rotation.to(torch.float64).T + camera.translation.to(torch.float64)
     local = local[local[:, 2] > 0]
     x = camera.fx * local[:, 0] / local[:, 2] + camera.cx

@@ -1,4 +1,4 @@
-"""The COLMAP model of the developed pictures: matched by name, scaled and undistorted."""
+"""Poses of developed pictures: a COLMAP model matched by name, rescaled and undistorted."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ class Geometry:
     """Crop and scale of a developed picture: developed = (stored - crop) / step, in pixels from the corner.
 
     Attributes:
-        stored: width and height of the stored picture, as displayed.
-        crop: columns and rows cut at the left and top.
+        stored: width and height of the stored picture.
+        crop: number of columns and rows that are cropped at the left and top.
         step: stored pixels per developed pixel.
         size: width and height of the developed picture.
     """
@@ -51,12 +51,12 @@ class Geometry:
 
 @dataclass(frozen=True, eq=False)
 class Undistortion:
-    """The map from a picture to that of a pinhole camera.
+    """Map from the pixels of a pinhole camera to those of a picture.
 
     Attributes:
-        source: the camera of the developed picture, as pycolmap's.
-        target: the pinhole camera.
-        moves: whether pixels move.
+        source: camera of the developed picture, as pycolmap's type.
+        target: pinhole camera.
+        moves: False for the identity.
     """
 
     source: Any
@@ -64,13 +64,13 @@ class Undistortion:
     moves: bool
 
     def record(self) -> dict[str, Any] | None:
-        """The distorted camera model, or None without distortion."""
+        """Return the distorted camera model for ``scene.json``; None without distortion."""
         if not self.moves:
             return None
         return {"model": self.source.model_name, "parameters": [float(value) for value in self.source.params]}
 
     def apply_mask(self, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Resample an object mask [H, W]; pixels outside the picture are background."""
+        """Resample a foreground mask [H, W]. Pixels outside the picture are background."""
         if not self.moves:
             return mask
         x, y = self._map
@@ -79,7 +79,7 @@ class Undistortion:
     def apply(
         self, intensities: NDArray[np.float32], invalid: NDArray[np.bool_]
     ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-        """Resample intensities [4, H, W, 3] with one map; pixels that use invalid or outside pixels become invalid."""
+        """Resample intensities [4, H, W, 3]. A pixel is invalid if it uses invalid or outside pixels."""
         if not self.moves:
             return intensities, invalid
         x, y = self._map
@@ -88,7 +88,7 @@ class Undistortion:
 
     @functools.cached_property
     def _map(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Source coordinates of the target's pixels, in OpenCV's convention."""
+        """Source coordinates of the target's pixels in OpenCV's convention."""
         rows, columns = np.mgrid[: self.target.height, : self.target.width]
         places = np.stack([columns.ravel() + 0.5, rows.ravel() + 0.5], axis=1)  # COLMAP's pixel centers
         rays = self.target.cam_from_img(places)
@@ -98,7 +98,11 @@ class Undistortion:
 
 
 def camera_for_picture(camera: Any, geometry: Geometry, where: str) -> Any:
-    """A COLMAP camera in the pixels of the developed picture."""
+    """Return a COLMAP camera in pixels of the developed picture.
+
+    Raises:
+        PolarguideError: the size of the camera does not match stored, developed or resized pictures.
+    """
     width, height = geometry.size
     size = (camera.width, camera.height)
     if size == geometry.size:
@@ -117,11 +121,11 @@ def camera_for_picture(camera: Any, geometry: Geometry, where: str) -> Any:
             where,
             expected=f"the size of the pictures, {width}x{height}{files}",
             found=f"{size[0]}x{size[1]}",
-            remedy="Give a model that was made from these pictures, without a crop.",
+            remedy="Use a model that was made from these pictures without a crop.",
         )
     fitted = copy.copy(camera)
     params = np.array(camera.params, dtype=np.float64)
-    for index, step in zip(camera.focal_length_idxs(), steps, strict=False):  # some models have one for both
+    for index, step in zip(camera.focal_length_idxs(), steps, strict=False):  # one or two focal lengths
         params[index] /= step
     for index, cut, step in zip(camera.principal_point_idxs(), crop, steps, strict=True):
         params[index] = (params[index] - cut) / step
@@ -131,12 +135,12 @@ def camera_for_picture(camera: Any, geometry: Geometry, where: str) -> Any:
     return fitted
 
 
-# Sizes nearer to one another than this may differ by the crop of an undistortion.
 _LEAST_STEP = 1.5
+"""Smallest ratio of a resized picture. Undistortion crops pictures by less."""
 
 
 def _is_resized(size: tuple[int, int], other: tuple[int, int]) -> bool:
-    """Whether two sizes differ by one factor, up to the rounding of the smaller one to whole pixels."""
+    """Return True if two sizes differ by one factor, up to rounding of the smaller size."""
     if size[0] * other[1] == size[1] * other[0]:
         return size[0] > 0
     small, large = sorted((size, other))
@@ -147,7 +151,7 @@ def _is_resized(size: tuple[int, int], other: tuple[int, int]) -> bool:
 
 
 def undistortion(camera: Any) -> Undistortion:
-    """The undistortion of pictures of a COLMAP camera."""
+    """Create the undistortion of the pictures of a COLMAP camera."""
     if not is_pinhole(camera):
         target = pycolmap.undistort_camera(pycolmap.UndistortCameraOptions(), camera)
         return Undistortion(camera, target, True)
@@ -158,18 +162,16 @@ def undistortion(camera: Any) -> Undistortion:
     return Undistortion(camera, target, False)
 
 
-Key = tuple[int, Geometry]
-
-
 class Poses:
-    """A COLMAP model and the views of a capture that it has poses for.
+    """COLMAP model and the views of a capture that it has poses of.
 
     Attributes:
-        views, missing: names of the views with a pose, and without.
-        folder, files: where the model is from.
-        assumed_sizes: views whose cameras came without a size, and have that of the pictures.
-        held_out: views that their origin keeps for tests.
-        notes, warnings: what the user should know of their origin.
+        views: names of the views with a pose.
+        missing: names of the views without a pose.
+        folder, files: origin of the model.
+        assumed_sizes: views whose camera file states no size; their cameras have the size of the pictures.
+        held_out: held-out views of the model's origin.
+        notes, warnings: messages about the origin.
     """
 
     assumed_sizes: frozenset[str] = frozenset()
@@ -182,13 +184,12 @@ class Poses:
 
         Args:
             model: pycolmap's ``Reconstruction``.
-            where: origin of the model, for messages.
+            where: origin of the model for messages.
             views: view names of the capture.
-            files: the files it was read from.
+            files: files that the model was read from.
 
         Raises:
-            PolarguideError: none of its images is a view, two images belong to one view, or a pose or camera
-                is invalid.
+            PolarguideError: no image belongs to a view, two images belong to one view, or a pose or camera is invalid.
         """
         self.folder = where
         self.files = tuple(files)
@@ -213,15 +214,15 @@ class Poses:
                     remedy="Keep one of them.",
                 )
             self._require_numbers(view)
-        self._warps: dict[Key, Undistortion] = {}
+        self._warps: dict[tuple[int, Geometry], Undistortion] = {}
         self._of_camera: dict[int, Undistortion] = {}
 
     @classmethod
     def read(cls, path: Path, views: list[str]) -> Poses:
-        """A model from a folder with its files, or with ``sparse/0`` or ``sparse``; it may lack points.
+        """Read a model from a folder with its files, ``sparse/0`` or ``sparse``. Points are optional.
 
         Raises:
-            PolarguideError: there is no readable model, or as for the model itself.
+            PolarguideError: there is no readable model, or the class rejects it.
         """
         folder, kind = find_model(path, points=False)
         files = [folder / (name + kind) for name in MODEL_FILES]
@@ -234,11 +235,11 @@ class Poses:
     def of_cameras(
         cls, cameras: Mapping[str, PosedCamera], where: Path, views: list[str], files: Sequence[Path] = ()
     ) -> Poses:
-        """A model without points from cameras by view name; ``where`` names their origin in messages."""
+        """Create a model without points from cameras by view name; ``where`` is their origin for messages."""
         return cls(posed_model(cameras), where, views, files)
 
     def others(self) -> list[tuple[Path, int]]:
-        """Models beside this one (``sparse/1`` beside ``sparse/0``), and how many of the views each has poses of."""
+        """List the models next to this one, such as ``sparse/1``, with the number of views that they have poses of."""
         names = {*self.views, *self.missing}
         counts = []
         for folder in sorted(self.folder.parent.glob("[0-9]*")) if self.folder.name.isdigit() else []:
@@ -256,17 +257,17 @@ class Poses:
         return len(self._model.points3D)
 
     def stated_size(self, view: str) -> tuple[int, int] | None:
-        """Width and height that the camera of a view was made for; None where nothing in its file tells."""
+        """Return width and height of a view's camera; None if its file states no size."""
         camera = self._model.cameras[self._images[view].camera_id]
         size = int(camera.width), int(camera.height)
         middle = (camera.principal_point_x, camera.principal_point_y) == (size[0] / 2, size[1] / 2)
         return None if view in self.assumed_sizes and middle else size
 
     def developed(self, geometries: Mapping[str, Geometry]) -> dict[str, PosedCamera]:
-        """Cameras of the developed pictures, including distortion, by view.
+        """Return the cameras of the developed pictures by view, with distortion.
 
         Raises:
-            PolarguideError: as in ``warp``.
+            PolarguideError: ``warp`` rejects a camera.
         """
         cameras = {}
         for view in self.views:
@@ -284,10 +285,10 @@ class Poses:
         return cameras
 
     def warp(self, view: str, geometry: Geometry) -> Undistortion:
-        """The undistortion of a view's picture.
+        """Return the undistortion of a view's picture.
 
         Raises:
-            PolarguideError: the camera is neither of the stored nor the developed size, nor a resized one.
+            PolarguideError: the camera does not have the stored or developed size, or a multiple of it.
         """
         number = self._images[view].camera_id
         key = (number, geometry)
@@ -299,13 +300,13 @@ class Poses:
             raise PolarguideError(
                 where,
                 expected="pictures of one size for one camera",
-                found=f"{geometry.size[0]}x{geometry.size[1]} beside another size",
-                remedy="Give each size a camera of its own in the model.",
+                found=f"{geometry.size[0]}x{geometry.size[1]} and another size",
+                remedy="Use a separate camera in the model for each size.",
             )
         return warp
 
     def write(self, folder: Path) -> None:
-        """Write the model for the developed pictures, binary; ``warp`` was called for every view."""
+        """Write the model of the developed pictures as binary files, after ``warp`` was called for every view."""
         model = copy.deepcopy(self._model)
         for image in model.images.values():
             if image.camera_id in self._of_camera and len(image.points2D):
@@ -322,6 +323,7 @@ class Poses:
         model.write_binary(str(folder))
 
     def _require_numbers(self, view: str) -> None:
+        """Raise an error if the pose or the lens of a view is invalid."""
         image = self._images[view]
         camera = self._model.cameras[image.camera_id]
         if not is_sound(image, camera, 1e-3):
@@ -332,11 +334,11 @@ class Poses:
                     f"{self.folder} (image {image.name})",
                     expected="a quaternion of length 1",
                     found=f"one of length {length:g}",
-                    remedy="Divide it by its length, or export the model again.",
+                    remedy="Normalize the quaternion, or export the model again.",
                 )
             raise PolarguideError(
                 f"{self.folder} (image {image.name})",
                 expected=f"a pose and a lens of numbers up to {FARTHEST:g}, {LENS}",
                 found=f"quaternion {pose.rotation.quat}, translation {pose.translation}, camera {camera.params}",
-                remedy="Export the model again, or leave the image out.",
+                remedy="Export the model again, or remove the image from it.",
             )

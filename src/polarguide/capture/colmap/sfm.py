@@ -1,4 +1,4 @@
-"""Features, their matches, and structure from motion, with pycolmap."""
+"""Feature matching and structure from motion with pycolmap."""
 
 from __future__ import annotations
 
@@ -47,33 +47,33 @@ def match_features(
     lenses: Mapping[str, Lens] | None = None,
     masks: Path | None = None,
 ) -> dict[str, tuple[int, int]]:
-    """Extract features, match them, and write features, matches and two-view geometries into the database.
+    """Extract and match features, and write them with two-view geometries to a database.
 
     Args:
-        database: the file; it is created, or continued where an earlier call stopped.
+        database: path of the database. Work of an interrupted call is resumed.
         images: folder of ``<view>.png``.
-        sizes: width and height of every picture, by view.
+        sizes: width and height of each picture by view.
         matching: "exhaustive" or "sequential".
         seed: seed of all random draws.
-        reporter: for progress.
-        cameras: intrinsics by view, where they are known.
-        lenses: by view, as the files state them; views of one share their intrinsics.
-        masks: folder of ``<view>.png``; features are extracted in white parts only. Views without a file have no mask.
+        reporter: reporter of the progress.
+        cameras: known intrinsics by view.
+        lenses: lenses by view from EXIF; views of one lens share their intrinsics.
+        masks: folder of ``<view>.png``. Features are extracted in white parts only, or everywhere without a file.
 
     Returns:
-        The ids of each view's image and camera in the database where ``cameras`` are given; else an empty dictionary.
+        Ids of image and camera in the database by view; empty without ``cameras``.
 
     Raises:
-        PolarguideError: COLMAP failed; the database is removed because it may be the cause.
+        PolarguideError: COLMAP failed. The database is removed because it may be the cause.
     """
-    groups = _sharing_a_camera(sizes, cameras, lenses)
+    groups = _group_by_camera(sizes, cameras, lenses)
     count = len(sizes)
     pairs = count * (count - 1) // 2 if matching == "exhaustive" else None
     where = {"database": str(database), "images": str(images)}
     masked = masks is not None and masks.is_dir() and any(masks.iterdir())
     extracted = {
         "groups": [[f"{view}.png" for view in group] for group in groups],
-        "masks": str(_named_for_colmap(masks, sizes)) if masked and masks is not None else None,
+        "masks": str(_copy_masks(masks, sizes)) if masked and masks is not None else None,
     }
     numbers: dict[str, tuple[int, int]] = {}
     try:
@@ -82,7 +82,7 @@ def match_features(
         if cameras is not None:
             numbers = _write_intrinsics(database, cameras)
         elif len(groups) > 1 and lenses:
-            _begin_with_focal_lengths(database, groups, lenses)
+            _scale_focal_lengths(database, groups, lenses)
         done = functools.partial(_rows, database, "two_view_geometries")
         matched = {"database": str(database), "matching": matching}
         run_step("match", matched, seed, reporter, "matching pairs", pairs, done)
@@ -94,15 +94,14 @@ def match_features(
     return numbers
 
 
-def _sharing_a_camera(
+def _group_by_camera(
     sizes: Mapping[str, tuple[int, int]],
     cameras: Mapping[str, PosedCamera] | None,
     lenses: Mapping[str, Lens] | None = None,
 ) -> list[list[str]]:
-    """The views, in groups that share their intrinsics: those of one lens and size, as where a camera was held upright
-    or not.
+    """Group the views that share their intrinsics: those with equal lens and size.
 
-    Known intrinsics that differ are each view's own.
+    Each view is a group of its own if the known intrinsics differ.
     """
     if cameras is not None and len({camera.intrinsics for camera in cameras.values()}) > 1:
         return [[view] for view in sizes]
@@ -112,41 +111,39 @@ def _sharing_a_camera(
     return list(groups.values())
 
 
-def _begin_with_focal_lengths(
-    database: Path, groups: Sequence[Sequence[str]], lenses: Mapping[str, Lens]
-) -> None:
-    """Begin with focal lengths in the ratio that the files state, around the one that COLMAP begins with."""
-    stated = [lens.focal if (lens := lenses.get(group[0])) is not None else None for group in groups]
-    known = [focal for focal in stated if focal]
+def _scale_focal_lengths(database: Path, groups: Sequence[Sequence[str]], lenses: Mapping[str, Lens]) -> None:
+    """Scale COLMAP's initial focal lengths by their ratios in EXIF."""
+    focals = [lens.focal if (lens := lenses.get(group[0])) is not None else None for group in groups]
+    middle = median(focal for focal in focals if focal)
     with pycolmap.Database.open(database) as link:
-        for group, focal in zip(groups, stated, strict=True):
+        for group, focal in zip(groups, focals, strict=True):
             if focal:
                 image = link.read_image_with_name(f"{group[0]}.png")
                 assert image is not None
                 camera = link.read_camera(image.camera_id)
                 params: Any = np.array(camera.params)
-                params[list(camera.focal_length_idxs())] *= focal / median(known)
+                params[list(camera.focal_length_idxs())] *= focal / middle
                 camera.params = params
                 link.update_camera(camera)
 
 
-def _named_for_colmap(masks: Path, sizes: Mapping[str, tuple[int, int]]) -> Path:
-    """Copies of the masks as ``<view>.png.png``, which COLMAP expects; white for views without, which it would skip."""
-    named = masks.with_name("colmap_masks")
-    make_folder(named)
+def _copy_masks(masks: Path, sizes: Mapping[str, tuple[int, int]]) -> Path:
+    """Copy masks to the name ``<view>.png.png`` of COLMAP, which skips views without a mask: theirs are white."""
+    folder = masks.with_name("colmap_masks")
+    make_folder(folder)
     for view, (width, height) in sizes.items():
         mask = masks / f"{view}.png"
-        wanted = named / f"{view}.png.png"
+        copy = folder / f"{view}.png.png"
         if mask.exists():
-            with writing(wanted):
-                shutil.copyfile(mask, wanted)
+            with writing(copy):
+                shutil.copyfile(mask, copy)
         else:
-            write_png(wanted, np.full((height, width), 255, np.uint8))
-    return named
+            write_png(copy, np.full((height, width), 255, np.uint8))
+    return folder
 
 
 def _write_intrinsics(database: Path, cameras: Mapping[str, PosedCamera]) -> dict[str, tuple[int, int]]:
-    """Replace the intrinsics that COLMAP guessed by the known ones; returns ids of image and camera by view."""
+    """Replace COLMAP's initial intrinsics by known ones and return the ids of image and camera by view."""
     numbers = {}
     with pycolmap.Database.open(database) as link:
         for view, camera in cameras.items():
@@ -166,16 +163,19 @@ def run_step(
     total: int | None = None,
     done: Callable[[], int] | None = None,
 ) -> Any:
-    """Run a step of COLMAP in a process of its own, which is ended where this call is left early.
+    """Run a step of COLMAP as a process, which is terminated when this call is interrupted.
 
     Args:
-        step, arguments: one of ``steps.STEPS``. seed: of COLMAP's generators.
-        reporter: for progress, under the name ``label``.
-        total: number of units of work; None if it is unknown.
-        done: returns the number of finished units; None: the step says it itself.
+        step: name of the step, a key of ``steps.STEPS``.
+        arguments: arguments of the step.
+        seed: seed of COLMAP's generators.
+        reporter: reporter of the progress.
+        label: name of the step for the user.
+        total: number of units of work, if known.
+        done: function that counts finished units; default: the step reports them.
 
     Returns:
-        The value that the step returns.
+        Return value of the step.
 
     Raises:
         PolarguideError: the step failed.
@@ -195,14 +195,14 @@ def run_step(
     try:
         with reporter.track(label, total) as advance:
             request = {"step": step, "seed": seed, "arguments": dict(arguments)}
-            with contextlib.suppress(BrokenPipeError):  # what ended it is told below
+            with contextlib.suppress(BrokenPipeError):  # the failure is reported below
                 process.stdin.write(json.dumps(request) + "\n")
                 process.stdin.flush()
             listener.start()
             while listener.is_alive():
                 listener.join(_POLL_SECONDS)
-                counts = [answer for answer in answers if isinstance(answer, int)]
-                advance(counts[-1] if counts and done is None else done() if done is not None else 0)
+                reported = max((answer for answer in answers if isinstance(answer, int)), default=0)
+                advance(reported if done is None else done())
             process.wait()
     finally:
         process.kill()
@@ -215,32 +215,35 @@ def run_step(
         label,
         expected="COLMAP to succeed",
         found=last.get("error", f"its process ended with status {process.returncode}"),
-        remedy="Repeat the command, or bring a model with --poses PATH.",
+        remedy="Repeat the command, or use an existing model with --poses PATH.",
     )
     return last["value"]
 
 
 def _rows(database: Path, table: str) -> int:
-    """How many rows a table of the database has; 0 where another process keeps it to itself."""
+    """Count the rows of a database table; 0 while another process locks it."""
     link = f"{database.absolute().as_uri()}?mode=ro"
     with (
         contextlib.suppress(sqlite3.Error),
-        contextlib.closing(sqlite3.connect(link, uri=True, timeout=0.1)) as opened,
+        contextlib.closing(sqlite3.connect(link, uri=True, timeout=0.1)) as connection,
     ):
-        return int(opened.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0])
+        return int(connection.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0])
     return 0
 
 
 SAMPLE = 7
-"""Matches that determine an epipolar geometry."""
+"""Number of matches that determine an epipolar geometry."""
 
 
 def log_false_alarms(matches: int, agreeing: int, share: float) -> float:
-    """Natural logarithm of the number of geometries expected by chance that fit as many of the matches.
+    """Return the natural logarithm of the expected number of chance geometries with as many inliers.
+
+    Source: Moisan and Stival, A Probabilistic Criterion to Detect Rigid Point Matches, IJCV 57(3), 2004.
 
     Args:
-        matches: matches of the two pictures. agreeing: those of them that fit.
-        share: share of the picture's area that fits an epipolar line, at most: the probability that a wrong match does.
+        matches: number of matches of the two pictures.
+        agreeing: number of inliers.
+        share: upper bound of the probability that a wrong match fits: share of the picture near an epipolar line.
     """
     if agreeing <= SAMPLE:
         return math.inf
@@ -253,11 +256,11 @@ def _log_choices(count: int, chosen: int) -> float:
 
 
 def connected_views(database: Path, sizes: Mapping[str, tuple[int, int]]) -> int:
-    """How many views there are in the largest group that pairs connect which agree better than by chance.
+    """Return the size of the largest group of views that is connected by pairs better than chance.
 
     Args:
-        database: of COLMAP, with matches and verified geometries of ``<view>.png``.
-        sizes: width and height of every picture, by view.
+        database: COLMAP database with matches and verified geometries of ``<view>.png``.
+        sizes: width and height of each picture by view.
     """
     error = pycolmap.TwoViewGeometryOptions().ransac.max_error
     with pycolmap.Database.open(database) as link:
@@ -276,25 +279,26 @@ def connected_views(database: Path, sizes: Mapping[str, tuple[int, int]]) -> int
 
 
 _FEW_SHARE = 0.8
-# With a smaller share of the views, mapping is tried again with fewer matches.
+"""Share of registered views below which the user is warned."""
 _ENOUGH_SHARE = 0.9
+"""Share of registered views below which mapping is retried with fewer matches."""
 LEAST_VIEWS = steps.LEAST_VIEWS
 ADVICE = (
-    "Take more pictures between those that are left out and their neighbors (15 degrees or less apart), put a textured "
+    "Take more pictures between unregistered views and their neighbors (15 degrees or less apart), put a textured "
     "ground under the object, and remove blurred pictures."
 )
 
 
 class NotConnectedError(PolarguideError):
-    """Structure from motion found no place for enough of the views."""
+    """Failure of structure from motion to register enough views."""
 
 
 def tone_mapped(intensities: NDArray[np.float32], pictures: str = "photograph") -> NDArray[np.uint8]:
-    """The photograph of a view as an 8-bit sRGB picture, [H, W, 3] RGB, with the 99th percentile at white.
+    """Return the photograph of a view as 8-bit sRGB, [H, W, 3] RGB, with the 99th percentile at white.
 
     Args:
-        intensities: [4, H, W, 3] linear.
-        pictures: "photograph" for S0/2, "minimum" for the least of the four, which has less glare.
+        intensities: linear intensities, [4, H, W, 3].
+        pictures: "photograph" for S0/2, or "minimum" for the minimum of the four intensities with less glare.
     """
     photograph = intensities.min(axis=0) if pictures == "minimum" else intensities.mean(axis=0)
     white = max(float(np.percentile(photograph, 99.0)), 1e-4)
@@ -316,27 +320,26 @@ def reconstruct(
 ) -> Path:
     """Estimate poses, intrinsics and points from ``folder/images/<view>.png``.
 
-    With a mask ``folder/masks/<view>.png``, features come from its white parts only. Features and matches are kept
-    in a database, so that an interrupted run does not repeat them. Where less than nine tenths of the views are
-    registered, mapping is tried again with half as many matches. The largest model is used.
+    With a mask ``folder/masks/<view>.png``, features come from its white parts only. A database keeps features and
+    matches for an interrupted run. If less than nine tenths of the views are registered, mapping is repeated with half
+    as many matches. The largest model is used.
 
     Args:
-        folder: holds the pictures; the database and the model are written there.
-        sizes: width and height of every picture, by view.
+        folder: folder of the pictures, the database and the model.
+        sizes: width and height of each picture by view.
         matching: "exhaustive", or "sequential" for views taken in the order of their names.
         seed: seed of the random numbers.
-        reporter: for progress and messages.
-        untried: the options that may connect more views, for messages.
-        intrinsics: model and parameters of all pictures, where they are known.
-        refine: whether to refine known intrinsics.
-        lenses: by view, as the files state them.
+        reporter: reporter of progress and messages.
+        untried: options that may connect more views, for messages.
+        intrinsics: known model and parameters of all pictures.
+        refine: if True, known intrinsics are refined.
+        lenses: lenses by view from EXIF.
 
     Returns:
-        The folder of the model, with one camera for pictures of one lens and size: of the model given, or
-        SIMPLE_RADIAL.
+        Folder of the model. Pictures of one lens and size share a camera of the specified model or SIMPLE_RADIAL.
 
     Raises:
-        NotConnectedError: fewer than three views were registered, or than matches connect better than by chance.
+        NotConnectedError: fewer than three views were registered, or their matches are no better than chance.
         PolarguideError: COLMAP failed.
     """
     model = folder / "model"
@@ -347,13 +350,17 @@ def reconstruct(
     trial = folder / "models"
     if lenses:
         counts = Counter(lenses.values())
-        words = listed([f"{lens.camera} {lens.focal or ''}: {count} views" for lens, count in counts.items()])
-        given = "each has its own" if intrinsics is None else "all are as given"
-        reporter.say(f"EXIF states {len(counts)} cameras or focal lengths ({words}); intrinsics: {given}.")
+        cameras_text = listed(
+            [f"{lens.camera} {lens.focal or ''}: {count} views" for lens, count in counts.items()]
+        )
+        scope = "one camera each" if intrinsics is None else "as specified for all"
+        reporter.say(
+            f"EXIF states {len(counts)} cameras or focal lengths ({cameras_text}); intrinsics: {scope}."
+        )
     cameras = None
     if intrinsics is not None:
-        still = np.eye(3), np.zeros(3)
-        cameras = {view: PosedCamera(*size, *intrinsics, *still) for view, size in sizes.items()}
+        pose = np.eye(3), np.zeros(3)
+        cameras = {view: PosedCamera(*size, *intrinsics, *pose) for view, size in sizes.items()}
     match_features(
         database, images, sizes,
         matching=matching, seed=seed, reporter=reporter, cameras=cameras, lenses=lenses,
@@ -363,7 +370,7 @@ def reconstruct(
     models = _map(database, images, trial, len(sizes), seed, reporter, free, weak=False)
     if _registered(models) < _ENOUGH_SHARE * len(sizes):
         reporter.say(
-            f"{_registered(models)} of {len(sizes)} views registered; trying with fewer matches a view."
+            f"{_registered(models)} of {len(sizes)} views registered; retrying with fewer matches per view."
         )
         others = _map(database, images, trial, len(sizes), seed, reporter, free, weak=True)
         models = max(models, others, key=_registered)
@@ -371,7 +378,7 @@ def reconstruct(
     registered = _registered(models)
     by_chance = best is not None and connected_views(database, sizes) < LEAST_VIEWS
     if best is None or registered < LEAST_VIEWS or by_chance:
-        why = ", by matches that agree no better than wrong ones would" if by_chance else ""
+        why = ", by matches that agree no better than chance" if by_chance else ""
         raise NotConnectedError(
             images,
             expected="pictures that structure from motion can connect",
@@ -386,7 +393,7 @@ def reconstruct(
     share = f"{registered} of {len(sizes)} views registered"
     reporter.say(
         f"{share}, {best.num_points3D()} points, mean reprojection error "
-        f"{best.compute_mean_reprojection_error():.2f} pixels; {len(models)} model(s) found."
+        f"{best.compute_mean_reprojection_error():.2f} pixels; number of models: {len(models)}."
     )
     if registered < _FEW_SHARE * len(sizes):
         reporter.warn(f"Only {share}. {ADVICE} {untried}")
@@ -394,7 +401,7 @@ def reconstruct(
 
 
 def _registered(models: Sequence[Any]) -> int:
-    """Views of the largest model."""
+    """Return the number of views of the largest model."""
     return max((model.num_reg_images() for model in models), default=0)
 
 
@@ -409,7 +416,7 @@ def _map(
     *,
     weak: bool,
 ) -> list[Any]:
-    """Incremental mapping, see ``steps.place``: pycolmap's models."""
+    """Run ``steps.place`` and read its models with pycolmap."""
     shutil.rmtree(trial, ignore_errors=True)
     make_folder(trial)
     arguments = {

@@ -1,12 +1,13 @@
-"""The steps of COLMAP, run as a program: a process of its own can be ended at any time, threads of C++ cannot.
+"""Run one step of COLMAP as a separate process, which can be terminated at any time.
 
-It reads one line of JSON, ``{"step": name, "seed": number, "arguments": {...}}``, and writes lines of JSON: numbers of
-finished units, then ``{"value": ...}`` or ``{"error": text}``. It ends when its standard input does, with the program
-that started it. Nothing of polarguide is imported, so that it starts quickly.
+Standard input has a line of JSON, ``{"step": name, "seed": number, "arguments": {...}}``. Standard output has lines of
+JSON: numbers of finished units, then ``{"value": ...}`` or ``{"error": text}``. The process ends with its parent, when
+standard input is closed. It imports no other module of polarguide, so it starts quickly.
 """
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import sys
@@ -15,29 +16,29 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 if __name__ == "__main__":
-    sys.path.pop(0)  # this folder, whose modules are called like others
+    sys.path.pop(0)  # this folder, whose modules have names of other packages
 
 import pycolmap
 
-# COLMAP logs every picture and pair; what fails comes as an exception.
+# Log level of COLMAP. Failures raise exceptions.
 _FATAL = 3
 LEAST_VIEWS = 3
-"""Views of the smallest model."""
+"""Number of views of the smallest model."""
 _WEAK_PAIR = 10
 _WEAK_START = 50
 _WEAK_POSE = 15
 Report = Callable[[int], None]
-"""Receives the number of finished units."""
+"""Callback for the number of finished units."""
 
 
 def set_seed(options: Any, seed: int) -> None:
-    """Set the seed of COLMAP's options, if this version of COLMAP has one."""
+    """Set the seed of COLMAP's options if this version has one."""
     if hasattr(options, "random_seed"):
         options.random_seed = seed
 
 
 def _pipeline_options(seed: int) -> pycolmap.IncrementalPipelineOptions:
-    """The options of mapping and triangulation, with all of their seeds."""
+    """Create the options of mapping and triangulation with all of their seeds."""
     options = pycolmap.IncrementalPipelineOptions()
     for part in (options, options.mapper, options.triangulation):
         set_seed(part, seed)
@@ -53,7 +54,7 @@ def extract(
     groups: Sequence[Sequence[str]],
     masks: str | None,
 ) -> None:
-    """Features of all pictures, with one camera for each group of names."""
+    """Extract the features of all pictures, with one camera for each group of names."""
     reading: dict[str, Any] = {}
     if masks is not None:
         reading["reader_options"] = pycolmap.ImageReaderOptions()
@@ -67,7 +68,7 @@ def extract(
 
 
 def match(seed: int, report: Report, *, database: str, matching: str) -> None:
-    """Match the features of pairs of pictures, and verify them."""
+    """Match the features of pairs of pictures and verify the matches."""
     verify = pycolmap.TwoViewGeometryOptions()
     set_seed(verify.ransac, seed)
     compare = pycolmap.match_exhaustive if matching == "exhaustive" else pycolmap.match_sequential
@@ -77,10 +78,20 @@ def match(seed: int, report: Report, *, database: str, matching: str) -> None:
 def place(
     seed: int, report: Report, *, database: str, images: str, models: str, free: bool, weak: bool
 ) -> list[int]:
-    """Incremental mapping into folders of ``models``, named by numbers; returns these.
+    """Run incremental mapping.
 
-    ``free`` intrinsics are estimated. ``weak`` asks for half as many matches as COLMAP usually does: small pictures
-    have few, and fewer still where reflections change from shot to shot behind a filter.
+    Args:
+        seed: seed of COLMAP's generators.
+        report: callback for the number of registered pictures.
+        database: path of the database.
+        images: folder of the pictures.
+        models: folder of the results. The folder of a model has its number as name.
+        free: if True, intrinsics are estimated.
+        weak: if True, half of COLMAP's default number of matches suffices. Small pictures have few matches, and so have
+            reflections that change behind a filter.
+
+    Returns:
+        Numbers of the models.
     """
     options = _pipeline_options(seed)
     options.min_model_size = LEAST_VIEWS
@@ -89,22 +100,21 @@ def place(
         options.mapper.init_min_num_inliers = _WEAK_START
         options.mapper.abs_pose_min_num_inliers = _WEAK_POSE
     options.ba_refine_focal_length = options.ba_refine_extra_params = free
-    placed: list[None] = []
+    counts = itertools.count(3)  # the first callback follows the third picture
 
-    def placed_one() -> None:
-        placed.append(None)
-        report(len(placed) + 2)  # the first call comes after the third picture
+    def report_next() -> None:
+        report(next(counts))
 
-    made = pycolmap.incremental_mapping(database, images, models, options, next_image_callback=placed_one)
-    for number, model in made.items():
+    results = pycolmap.incremental_mapping(database, images, models, options, next_image_callback=report_next)
+    for number, model in results.items():
         folder = os.path.join(models, str(number))
         os.makedirs(folder, exist_ok=True)
         model.write_binary(folder)
-    return sorted(made)
+    return sorted(results)
 
 
 def triangulate(seed: int, report: Report, *, database: str, images: str, start: str, out: str) -> None:
-    """Points for the poses of the model in ``start``, which stay as they are; writes the model to ``out``."""
+    """Triangulate points with the fixed poses of the model in ``start`` and write the model to ``out``."""
     options = _pipeline_options(seed)
     for name in ("focal_length", "principal_point", "extra_params"):
         setattr(options, f"ba_refine_{name}", False)
@@ -112,39 +122,34 @@ def triangulate(seed: int, report: Report, *, database: str, images: str, start:
     pycolmap.triangulate_points(model, database, images, out, options=options).write_binary(out)
 
 
-STEPS: dict[str, Callable[..., Any]] = {
-    "extract": extract,
-    "match": match,
-    "place": place,
-    "triangulate": triangulate,
-}
+STEPS: dict[str, Callable[..., Any]] = {step.__name__: step for step in (extract, match, place, triangulate)}
 
 
-def _end_with(parent: Any) -> None:
-    """End this process where its standard input ends."""
+def _exit_with(parent: Any) -> None:
+    """End this process when its standard input is closed."""
     parent.read()
     os._exit(1)
 
 
-def main() -> None:
-    """Run the step that standard input names."""
+def run_request() -> None:
+    """Run the step that standard input requests."""
     answers = os.fdopen(os.dup(1), "w", buffering=1)
-    os.dup2(2, 1)  # whatever C++ prints is no answer
+    os.dup2(2, 1)  # C++ code prints to standard error
     request = json.loads(sys.stdin.readline())
-    threading.Thread(target=_end_with, args=(sys.stdin,), daemon=True).start()
+    threading.Thread(target=_exit_with, args=(sys.stdin,), daemon=True).start()
     pycolmap.logging.minloglevel = _FATAL
     pycolmap.set_random_seed(request["seed"])
     try:
         step = STEPS[request["step"]]
         value = step(request["seed"], lambda count: print(count, file=answers), **request["arguments"])
         answer = {"value": value}
-    except Exception as error:  # whatever C++ threw
+    except Exception as error:  # any C++ error
         lines = str(error).strip().splitlines() or [type(error).__name__]
         answer = {"error": lines[0].rstrip(".")}
     print(json.dumps(answer), file=answers)
     answers.close()
-    os._exit(0)  # destructors of C++ threads have nothing to add
+    os._exit(0)  # skip the destructors of C++ threads
 
 
 if __name__ == "__main__":
-    main()
+    run_request()

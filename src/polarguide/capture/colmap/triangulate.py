@@ -1,4 +1,4 @@
-"""3D points for given poses: triangulated from feature matches, or sampled in the visual hull."""
+"""3D points for known poses: triangulated from feature matches, or sampled in the visual hull."""
 
 from __future__ import annotations
 
@@ -22,10 +22,15 @@ from polarguide.core.progress import Reporter
 from polarguide.core.records import read_record
 
 _ROUNDS = 4
+"""Number of times that the sampled box shrinks."""
 _BATCH = 100_000
+"""Number of samples per batch."""
 _SHARE_OF_VIEWS = 0.8
+"""Share of the cameras that must see a point."""
 _SHARE_IN_MASKS = 0.95
+"""Share of these cameras whose mask must contain the point."""
 _BATCHES = 40
+"""Largest number of batches of samples."""
 
 Points = NDArray[np.float64]
 
@@ -36,20 +41,20 @@ def sample_visual_hull(
     count: int,
     rng: np.random.Generator,
 ) -> Points:
-    """Random points that most cameras see, inside the object masks where there are any.
+    """Sample random points in the common field of view of most cameras, inside the foreground masks.
 
-    A point counts if 80 % of the cameras (those with masks, where there are any) see it, and 95 % of these see
-    it inside their mask. The box to sample from starts around the point nearest to all optical axes, with the
-    cameras' median distance from it as half its side, and shrinks to the points found.
+    A point counts if 80 % of the cameras see it, and 95 % of these inside their mask. If there are masks, only cameras
+    with a mask count. The sampled box starts around the point nearest to all optical axes. Half of its side is the
+    median distance of the cameras from this point. The box shrinks to the points that count.
 
     Args:
-        cameras: by view; distortion is respected.
-        masks: object masks by view, [H, W] at the cameras' sizes; may be empty.
-        count: how many points are wanted.
-        rng: for the draws.
+        cameras: cameras by view, with distortion.
+        masks: foreground masks by view, [H, W] at the cameras' sizes; may be empty.
+        count: requested number of points.
+        rng: random generator.
 
     Returns:
-        [N, 3] with N up to ``count``; N is 0 if enough cameras see no common point.
+        [N, 3] with N up to ``count``; empty if no point is visible in enough cameras.
     """
     used = {view: camera for view, camera in cameras.items() if not masks or view in masks}
     pixels = {view: colmap_camera(camera) for view, camera in used.items()}
@@ -59,31 +64,27 @@ def sample_visual_hull(
 
     def samples_inside(batch: int) -> Points:
         places = rng.uniform(low, high, (batch, 3))
-        return places[_seen_by_most(places, used, pixels, masks)]
+        return places[_visible_to_most(places, used, pixels, masks)]
 
     for _ in range(_ROUNDS):
         inner = samples_inside(_BATCH)
-        if len(inner) == 0:
+        if not len(inner):
             return inner
         margin = 0.05 * (inner.max(axis=0) - inner.min(axis=0)) + 0.01 * reach
         low = np.maximum(low, inner.min(axis=0) - margin)
         high = np.minimum(high, inner.max(axis=0) + margin)
-    parts = []
-    total = 0
-    for _ in range(_BATCHES):
+    parts: list[Points] = []
+    while len(parts) < _BATCHES and sum(map(len, parts)) < count:
         parts.append(samples_inside(_BATCH))
-        total += len(parts[-1])
-        if total >= count:
-            break
     return np.concatenate(parts)[:count]
 
 
 def _nearest_to_axes(cameras: list[PosedCamera]) -> tuple[Points, float]:
-    """The point nearest to all optical axes (least squares), and the cameras' median distance from it."""
+    """Return the least-squares point nearest to all optical axes, and the cameras' median distance from it."""
     centers = np.stack([camera.center for camera in cameras])
     axes = np.stack([camera.rotation[2] for camera in cameras])
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
-    # A little weight at the cameras' mean keeps parallel axes solvable.
+    # A small weight of the cameras' mean keeps the system solvable for parallel axes.
     matrix = across.sum(axis=0) + 1e-6 * len(cameras) * np.eye(3)
     goal = (across @ centers[:, :, None]).sum(axis=0)[:, 0] + 1e-6 * centers.sum(axis=0)
     center = np.linalg.solve(matrix, goal)
@@ -91,13 +92,13 @@ def _nearest_to_axes(cameras: list[PosedCamera]) -> tuple[Points, float]:
     return center, max(reach, 1e-6)
 
 
-def _seen_by_most(
+def _visible_to_most(
     places: Points,
     cameras: Mapping[str, PosedCamera],
     pixels: Mapping[str, pycolmap.Camera],
     masks: Mapping[str, NDArray[np.bool_]],
 ) -> NDArray[np.bool_]:
-    """Which points [N, 3] enough cameras see, inside their masks: [N]."""
+    """Return a mask [N] of the points [N, 3] that enough cameras see inside their masks."""
     counts = np.zeros(len(places))
     inside = np.zeros(len(places))
     for view, camera in cameras.items():
@@ -115,9 +116,11 @@ def _seen_by_most(
 
 
 FEWEST = 200
-"""With fewer triangulated points than this, points are sampled in the visual hull instead."""
+"""Number of triangulated points below which points are sampled in the visual hull instead."""
 SAMPLES = 20_000
+"""Number of points that are sampled in the visual hull."""
 NOTE_FILE = "points.json"
+"""Name of the file with the origin and number of the points."""
 
 
 def add_points(
@@ -129,22 +132,22 @@ def add_points(
     seed: int,
     reporter: Reporter,
 ) -> tuple[Path, dict[str, Any]]:
-    """Add 3D points to given cameras; the cameras stay as they are.
+    """Add 3D points to cameras without changing the cameras.
 
-    Features of ``folder/images/<view>.png`` are matched and triangulated with the poses held fixed. If fewer
-    than ``FEWEST`` points result, points are sampled in the visual hull of ``folder/masks/<view>.png``, or in the
-    cameras' common field of view if there are no masks.
+    Features of ``folder/images/<view>.png`` are matched and triangulated with fixed poses. If fewer than ``FEWEST``
+    points result, points are sampled in the visual hull of ``folder/masks/<view>.png``, or in the common field of view
+    without masks.
 
     Args:
-        folder: working folder; results of an earlier call in it are used.
-        cameras: cameras of the pictures in it, by view.
-        where: the origin of the poses, for messages.
+        folder: working folder; results of an earlier call are reused.
+        cameras: cameras of its pictures by view.
+        where: origin of the poses for messages.
         matching: "exhaustive" or "sequential".
         seed: seed of all random draws.
-        reporter: for progress and messages.
+        reporter: reporter of progress and messages.
 
     Returns:
-        The folder of the model, and a record of the origin and number of its points.
+        Folder of the model, and a record of the origin and number of its points.
 
     Raises:
         PolarguideError: the cameras have no common field of view, or a file cannot be written.
@@ -168,7 +171,7 @@ def add_points(
         record = _sample(folder, start, trial, cameras, count, where, seed, reporter)
     else:
         reporter.say(
-            f"The poses came without points: {count} were triangulated, mean reprojection error {error:.2f} pixels."
+            f"The poses have no points: {count} were triangulated, mean reprojection error {error:.2f} pixels."
         )
     with writing(model):
         shutil.rmtree(model, ignore_errors=True)
@@ -186,7 +189,7 @@ def _triangulated(
     seed: int,
     reporter: Reporter,
 ) -> tuple[int, float | None]:
-    """Triangulate into ``trial``; returns the number of points and their mean reprojection error."""
+    """Triangulate into ``trial`` and return the number of points with their mean reprojection error."""
     database = folder / "database.db"
     images = folder / "images"
     sizes = {view: (camera.width, camera.height) for view, camera in cameras.items()}
@@ -196,15 +199,15 @@ def _triangulated(
         )
         with writing(start):
             posed_model(cameras, numbers).write_binary(str(start))
-        arguments = {"database": database, "images": images, "start": start, "out": trial}
-        words = {name: str(path) for name, path in arguments.items()}
-        run_step("triangulate", words, seed, reporter, "triangulating")
+        paths = {"database": database, "images": images, "start": start, "out": trial}
+        arguments = {name: str(path) for name, path in paths.items()}
+        run_step("triangulate", arguments, seed, reporter, "triangulating")
     except PolarguideError as error:
         reporter.warn(f"Triangulation failed ({error.found}).")
         return 0, None
-    made = load_model(trial, ".bin")
-    count = len(made.points3D)
-    return count, float(made.compute_mean_reprojection_error()) if count else None
+    model = load_model(trial, ".bin")
+    count = len(model.points3D)
+    return count, float(model.compute_mean_reprojection_error()) if count else None
 
 
 def _sample(
@@ -217,6 +220,7 @@ def _sample(
     seed: int,
     reporter: Reporter,
 ) -> dict[str, Any]:
+    """Sample points in the visual hull, write the model to ``trial`` and return a record of its points."""
     masks = {}
     for view in cameras:
         path = folder / "masks" / f"{view}.png"
@@ -228,8 +232,8 @@ def _sample(
         len(places),
         where,
         expected="poses of cameras with a common field of view",
-        found=f"{triangulated} triangulated points, and nothing in {kind}",
-        remedy="Check the poses (world to camera, axes right, down, forward), or bring a model with points.",
+        found=f"{triangulated} triangulated points and an empty {kind.removeprefix('the ')}",
+        remedy="Check the poses (world to camera, axes right, down, forward), or use a model with points.",
     )
     model = load_model(start, ".bin")
     for place, color in zip(places, _colors(folder, cameras, places), strict=True):
@@ -238,8 +242,8 @@ def _sample(
     make_folder(trial)
     model.write_binary(str(trial))
     reporter.warn(
-        f"The poses came without points, and only {triangulated} could be triangulated (fewer than {FEWEST}): "
-        f"{len(places)} points were sampled at random in {kind} instead. They do not lie on the surface."
+        f"The poses have no points, and only {triangulated} could be triangulated (fewer than {FEWEST}): "
+        f"{len(places)} points were sampled at random in {kind} instead. They are not on the surface."
     )
     return {"from": f"random samples in {kind}", "count": len(places), "triangulated": triangulated}
 
@@ -247,7 +251,7 @@ def _sample(
 def _colors(
     folder: Path, cameras: Mapping[str, PosedCamera], places: NDArray[np.float64]
 ) -> NDArray[np.uint8]:
-    """Mean color of the photographs at the projections of points [N, 3], [N, 3] RGB."""
+    """Return the mean color of the photographs at the projections of points [N, 3], [N, 3] RGB."""
     total = np.zeros((len(places), 3))
     counts = np.zeros(len(places))
     views = sorted(cameras)
@@ -256,7 +260,7 @@ def _colors(
         picture = decode_picture(path, read_picture(path))
         camera = cameras[view]
         local = places @ camera.rotation.T + camera.translation
-        plain = colmap_camera(camera)  # without its distortion
+        plain = colmap_camera(camera)  # projected without distortion
         focal = np.array([plain.focal_length_x, plain.focal_length_y])
         center = np.array([plain.principal_point_x, plain.principal_point_y])
         pixel = local[:, :2] / np.maximum(local[:, 2:], 1e-9) * focal + center

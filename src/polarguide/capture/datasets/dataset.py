@@ -1,4 +1,4 @@
-"""The common interface of published datasets, and their cameras in COLMAP's conventions."""
+"""Common interface of published datasets, with cameras in COLMAP's conventions."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ from polarguide.core.errors import PolarguideError, PolarguideWarning, require
 from polarguide.core.text import listed
 
 StokesImage = tuple[NDArray[np.float32], NDArray[np.bool_]]
-"""Stokes vectors of a view [3, H, W, 3] in the dataset's own sense of angles; pixels at full scale in its pictures."""
+"""Stokes vectors in the dataset's own sense of angles [3, H, W, 3], and a mask of clipped pixels [H, W]."""
 
 
 def read_mask(path: Path) -> NDArray[np.bool_]:
-    """An object mask [H, W] from a picture: pixels of at least half its largest value.
+    """Read a foreground mask [H, W] from a picture: pixels of at least half its maximum.
 
-    If the picture is transparent around the object, the mask has the pixels that are at least half opaque.
+    In a picture with transparent pixels, the mask has the pixels that are at least half opaque.
     """
     data = read_picture(path)
     pixels = decode_stored(path, data)
@@ -49,19 +49,19 @@ def read_mask(path: Path) -> NDArray[np.bool_]:
 
 @dataclass(frozen=True, eq=False)
 class Dataset:
-    """A folder of a published dataset.
+    """Views, cameras and masks of a published dataset.
 
     Attributes:
         name: "pandora", "pisr", ...
         views: view names, sorted.
         paths: all files that are read.
-        files: view -> a file of it, whose header has the size of the view's picture.
-        cameras: view -> camera; None where the folder has none of its own.
-        read_stokes: reads the Stokes vectors of a view; None if ``mosaics`` holds raw files instead.
-        masks: view -> file of its object mask, for the views that have one.
-        read_mask: reads such a file, [H, W].
+        files: a file of each view whose header has the size of the view's picture.
+        cameras: cameras by view; None if the folder has no cameras.
+        read_stokes: function that reads the Stokes vectors of a view; None for a dataset of raw mosaics.
+        masks: files of foreground masks by view; some views may have no mask.
+        read_mask: function that reads such a file, [H, W].
         sense: direction in which angles increase as displayed, "ccw" or "cw".
-        sense_known: whether the release and the programs that read it agree on the sense.
+        sense_known: True if the release and the programs that read it agree on the sense.
         mosaics: folder of raw mosaics, or None.
         gamma: exponent of the mosaics' stored values: stored = linear ^ gamma.
         notes: messages for the user.
@@ -83,14 +83,14 @@ class Dataset:
 
 
 def masks_beside(root: Path, views: Mapping[str, int]) -> dict[str, Path]:
-    """Object masks by view: the pictures in ``mask/`` or ``masks/``, whichever there is, called like the views.
+    """Find the foreground masks by view: the pictures in ``mask/`` or ``masks/`` with the names of the views.
 
-    Names may be numbers with more or fewer zeros before them, if every view has one. Views without a mask beside others
-    with one are warned of.
+    Names may be numbers with other leading zeros if each view has such a mask. The user is warned if only some of the
+    views have a mask.
 
     Args:
-        root: the dataset.
-        views: view -> its number.
+        root: folder of the dataset.
+        views: numbers of the views by name.
     """
     pictures = index_files(root / "mask", SUFFIXES) or index_files(root / "masks", SUFFIXES)
     masks = {view: pictures[view] for view in views if view in pictures}
@@ -99,19 +99,15 @@ def masks_beside(root: Path, views: Mapping[str, int]) -> dict[str, Path]:
         masks = {view: by_number[number] for view, number in views.items()}
     without = [view for view in views if view not in masks]
     if pictures and without:
-        text = f"{next(iter(pictures.values())).parent} has no mask called like {len(without)} of {len(views)} views"
+        text = f"{next(iter(pictures.values())).parent} has no mask for {len(without)} of {len(views)} views"
         warnings.warn(f"{text} ({listed(without)}).", PolarguideWarning, stacklevel=2)
     return masks
 
 
 def not_as_published(where: object, expected: str, found: str) -> PolarguideError:
-    """The error that a file of a dataset is not what its authors published."""
-    return PolarguideError(
-        where,
-        expected=expected,
-        found=found,
-        remedy="Take the files from the dataset as they were published.",
-    )
+    """Return the error of a file that differs from the published dataset."""
+    remedy = "Use the files of the dataset as they were published."
+    return PolarguideError(where, expected=expected, found=found, remedy=remedy)
 
 
 def require_published(condition: object, where: object, expected: str, found: str) -> None:
@@ -124,28 +120,38 @@ def require_published(condition: object, where: object, expected: str, found: st
         raise not_as_published(where, expected, found)
 
 
+def _read_planes(paths: Sequence[Path]) -> NDArray[np.float32]:
+    """Read linear pictures of one size, [N, H, W, 3]."""
+    planes = [read_radiance(path) for path in paths]
+    for path, plane in zip(paths, planes, strict=True):
+        require_same_shape(path, plane.shape, planes[0].shape, paths[0])
+    return np.stack(planes)
+
+
 def stokes_dataset(
     name: str,
     parts: Sequence[str],
     files: Mapping[str, Sequence[Path]],
-    stokes: Callable[[NDArray[np.float32]], NDArray[np.float32]],
     cameras_file: Path | None,
     cameras: Mapping[str, PosedCamera] | None,
     masks: Mapping[str, Path],
     *,
+    read: Callable[[Sequence[Path]], NDArray[np.float32]] = _read_planes,
+    stokes: Callable[[NDArray[np.float32]], NDArray[np.float32]] = np.asarray,
     read_mask: Callable[[Path], NDArray[np.bool_]] = read_mask,
     sense: Sense = "ccw",
     sense_known: bool = True,
     notes: tuple[str, ...] = (),
 ) -> Dataset:
-    """A dataset whose Stokes vectors follow from three radiance files a view.
+    """Create a dataset whose Stokes vectors follow from the files of a view.
 
     Args:
-        name, cameras, masks, read_mask, sense, sense_known, notes: as in ``Dataset``.
-        parts: what the three files of a view are called in messages.
-        files: view -> its three files.
-        stokes: the Stokes vectors [3, H, W, 3], given the three pictures [3, H, W, 3].
-        cameras_file: the file of the cameras, if there is one.
+        name, cameras, masks, read_mask, sense, sense_known, notes: attributes of ``Dataset``.
+        parts: names of the files of a view for messages.
+        files: files by view, one for each part.
+        cameras_file: file of the cameras, if there is one.
+        read: function that reads the files of a view as three pictures [3, H, W, 3]; default: one linear picture each.
+        stokes: function that converts these pictures to Stokes vectors [3, H, W, 3]; default: they are Stokes vectors.
 
     Raises:
         PolarguideError: a file is missing.
@@ -154,25 +160,24 @@ def stokes_dataset(
         require_files({view: paths[index] for view, paths in files.items()}, part)
 
     def read_stokes(view: str) -> StokesImage:
-        planes = [read_radiance(path) for path in files[view]]
-        for path, plane in zip(files[view], planes, strict=True):
-            require_same_shape(path, plane.shape, planes[0].shape, files[view][0])
-        return stokes(np.stack(planes)), np.zeros(planes[0].shape[:2], bool)
+        planes = read(files[view])
+        return stokes(planes), np.zeros(planes.shape[1:3], bool)
 
-    paths = [*(path for of_view in files.values() for path in of_view), *masks.values()]
-    paths += [] if cameras_file is None else [cameras_file]
-    first = {view: of_view[0] for view, of_view in files.items()}
     return Dataset(
-        name,
-        sorted(files),
-        paths,
-        first,
-        cameras,
-        read_stokes,
-        masks,
-        read_mask,
-        sense,
-        sense_known,
+        name=name,
+        views=sorted(files),
+        paths=[
+            *(path for paths in files.values() for path in paths),
+            *masks.values(),
+            *([] if cameras_file is None else [cameras_file]),
+        ],
+        files={view: paths[0] for view, paths in files.items()},
+        cameras=cameras,
+        read_stokes=read_stokes,
+        masks=masks,
+        read_mask=read_mask,
+        sense=sense,
+        sense_known=sense_known,
         notes=notes,
     )
 
@@ -189,38 +194,36 @@ def require_files(files: Mapping[str, Path], kind: str) -> None:
             path,
             expected=f"the {kind} of view {view}",
             found="nothing",
-            remedy="Add the file, or remove the others of the view.",
+            remedy="Add the file, or remove the other files of the view.",
         )
 
 
 def cameras_of_views(
     path: Path, numbers: Mapping[str, int], cameras: Mapping[int, PosedCamera], entry: str
 ) -> dict[str, PosedCamera]:
-    """Cameras by view name.
+    """Return the cameras by view name.
 
     Args:
-        path: the camera file, for messages.
-        numbers: view -> number of its camera.
-        cameras: by number.
-        entry: name of an entry of the file, without its number.
+        path: camera file for messages.
+        numbers: number of each view's camera.
+        cameras: cameras by number.
+        entry: name of an entry of the file without its number.
 
     Raises:
-        PolarguideError: a view has none.
+        PolarguideError: a view has no camera.
     """
     without = [view for view, number in numbers.items() if number not in cameras]
     if without:
-        number = numbers[without[0]]
-        raise PolarguideError(
+        raise not_as_published(
             path,
-            expected=f"the entry {entry}{number} for view {without[0]}",
-            found=f"none; {len(without)} of {len(numbers)} views have no camera ({listed(without)})",
-            remedy="Take the file from the dataset as it was published.",
+            f"the entry {entry}{numbers[without[0]]} for view {without[0]}",
+            f"none; {len(without)} of {len(numbers)} views have no camera ({listed(without)})",
         )
     return {view: cameras[number] for view, number in numbers.items()}
 
 
 def require_same_shape(path: Path, shape: tuple[int, ...], first: tuple[int, ...], like: Path) -> None:
-    """Check that a file has the size of another one of its view.
+    """Check that a file has the size of another file of its view.
 
     Raises:
         PolarguideError: the sizes differ.
@@ -230,29 +233,29 @@ def require_same_shape(path: Path, shape: tuple[int, ...], first: tuple[int, ...
 
 
 def numbered_views(stems: set[str]) -> dict[str, int]:
-    """View -> number, for the stems that are numbers."""
+    """Return the numbers of views whose names are numbers."""
     return {stem: int(stem) for stem in sorted(stems) if stem.isascii() and stem.isdigit() and len(stem) < 7}
 
 
 def first_picture_size(pictures: Mapping[str, Path], folder: Path) -> tuple[int, int]:
-    """Width and height of the first picture, which the intrinsics belong to.
+    """Return width and height of the first picture, to which the intrinsics refer.
 
     Raises:
-        PolarguideError: there is none, or it is damaged.
+        PolarguideError: there are no pictures, or the first one is damaged.
     """
-    require_published(pictures, folder, "the pictures that the intrinsics belong to", "none")
+    require_published(pictures, folder, "the pictures of the intrinsics", "none")
     path = pictures[min(pictures)]
     height, width = decode_stored(path, read_picture(path)).shape[:2]
     return width, height
 
 
 def resized_mask(dataset: Dataset, view: str, size: tuple[int, int]) -> NDArray[np.bool_] | None:
-    """The object mask of a view at a picture size (height, width), or None where it has none.
+    """Return the foreground mask of a view at a picture size (height, width); None without a mask.
 
-    A mask of another resolution is resized: where half of a pixel or more is object.
+    In a resized mask, a pixel is foreground if at least half of it is.
 
     Raises:
-        PolarguideError: the mask has another aspect.
+        PolarguideError: the mask has another aspect ratio.
     """
     if view not in dataset.masks:
         return None
@@ -263,7 +266,7 @@ def resized_mask(dataset: Dataset, view: str, size: tuple[int, int]) -> NDArray[
     require_published(
         abs(height * size[1] - width * size[0]) <= max(height, width),
         f"mask of view {view}",
-        f"the aspect of the pictures, {size[1]}x{size[0]}",
+        f"the aspect ratio of the pictures, {size[1]}x{size[0]}",
         f"{width}x{height}",
     )
     way = cv2.INTER_AREA if height > size[0] else cv2.INTER_LINEAR
@@ -271,7 +274,8 @@ def resized_mask(dataset: Dataset, view: str, size: tuple[int, int]) -> NDArray[
 
 
 _LARGEST_SKEW = 1e-3
-# Of IDR and the files that it was made after.
+"""Largest skew of a pixel, relative to the focal length."""
+# Entries of IDR and related programs.
 _IDR_ENTRY = re.compile(r"((world|scale|camera)_mat_(inv_)?|pose_mat_)\d{1,6}")
 _SQUARE = ((3, 4), (4, 4))
 Matrix = NDArray[np.float64]
@@ -282,8 +286,8 @@ class Projections:
     """Cameras of IDR.
 
     Attributes:
-        cameras: number -> K [3, 3] with K[2, 2] = 1, world-to-camera rotation [3, 3] and translation [3].
-        padded: whether numbers below 10 have a leading zero, as names of pictures do.
+        cameras: K [3, 3] with K[2, 2] = 1, world-to-camera rotation [3, 3] and translation [3] by number.
+        padded: True if numbers below 10 have a leading zero, like names of pictures.
     """
 
     cameras: dict[int, tuple[Matrix, Matrix, Matrix]]
@@ -291,14 +295,13 @@ class Projections:
 
 
 def read_projections(path: Path) -> Projections:
-    """Cameras of a file with ``world_mat_<i>`` and ``scale_mat_<i>`` (IDR): P = world_mat @ scale_mat.
+    """Read cameras from a file with ``world_mat_<i>`` and ``scale_mat_<i>`` (IDR): P = world_mat @ scale_mat.
 
-    The world of the result is the normalized one, in which the object lies in the unit sphere. The inverses that some
-    files hold, too, say nothing else.
+    The world of the result is normalized: the object is in the unit sphere. Inverse matrices in the file are redundant.
 
     Raises:
-        PolarguideError: the file has no camera, a matrix is not that of a camera, two have one number, or they project
-            to other units than pixels.
+        PolarguideError: the file has no camera, a matrix is invalid, two cameras have one number, or the matrices
+            do not project to pixels.
     """
     arrays = read_arrays(path)
     parts: dict[int, tuple[Matrix, Matrix, Matrix]] = {}
@@ -312,7 +315,7 @@ def read_projections(path: Path) -> Projections:
             number not in parts,
             path,
             f"one camera of the number {number}",
-            "two, with and without zeros before it",
+            "two, with and without leading zeros",
         )
         padded |= match[1] != str(number)
         scale_key = f"scale_mat_{match[1]}"
@@ -326,9 +329,8 @@ def read_projections(path: Path) -> Projections:
         require_entries(path, arrays, scale_key)
         world = finite_numbers(f"{path} ({key})", arrays[key], _SQUARE)
         scale = finite_numbers(f"{path} ({scale_key})", arrays[scale_key], ((4, 4),))
-        if size := float(
-            np.linalg.norm(scale[:3, :3], 2)
-        ):  # of a rotation and one scale: nothing is stretched
+        size = float(np.linalg.norm(scale[:3, :3], 2))
+        if size:  # the matrix must be a rotation with a uniform scale
             checked_pose(f"{path} ({scale_key})", scale[:3] / size)
         parts[number] = decompose_projection(f"{path} ({key} @ {scale_key})", (world @ scale)[:3])
     if not parts:
@@ -338,21 +340,22 @@ def read_projections(path: Path) -> Projections:
 
 
 def _is_identity(matrix: NDArray[Any]) -> bool:
+    """Return True for an identity matrix of any size."""
     return (
         matrix.ndim == 2 and matrix.shape[0] == matrix.shape[1] and np.allclose(matrix, np.eye(len(matrix)))
     )
 
 
-def require_known_names(path: Path, strangers: Iterable[str]) -> None:
-    """Warn of fields of a camera file that are not read, by name, if there are any."""
-    names = sorted(strangers)
+def require_known_names(path: Path, unknown: Iterable[str]) -> None:
+    """Warn about unknown fields of a camera file, if there are any."""
+    names = sorted(unknown)
     if names:
-        text = f"{path.name} has fields that polarguide does not know and does not use: {listed(names)}."
+        text = f"{path.name} has unknown fields, which are ignored: {listed(names)}."
         warnings.warn(text, PolarguideWarning, stacklevel=2)
 
 
 def decompose_projection(where: object, projection: Matrix) -> tuple[Matrix, Matrix, Matrix]:
-    """K, R and t of a 3x4 matrix s K [R | t] of any scale s.
+    """Decompose a 3x4 matrix s K [R | t] of any scale s into K, R and t.
 
     Raises:
         PolarguideError: the matrix is singular, or its pixels are skewed.
@@ -361,7 +364,7 @@ def decompose_projection(where: object, projection: Matrix) -> tuple[Matrix, Mat
     require_camera(
         np.linalg.cond(left) < 1e10, where, "a camera matrix that can be inverted", "a singular one"
     )
-    if np.linalg.det(left) < 0:  # a matrix means the same with the other sign; rotations have determinant 1
+    if np.linalg.det(left) < 0:  # the scale may be negative, and rotations have determinant 1
         projection = -projection
         left = -left
     inner, rotation = rq(left)
@@ -373,10 +376,10 @@ def decompose_projection(where: object, projection: Matrix) -> tuple[Matrix, Mat
 
 
 def checked_intrinsics(where: object, inner: Matrix) -> Matrix:
-    """K, checked to be an intrinsic matrix without skew.
+    """Check an intrinsic matrix and return it.
 
     Raises:
-        PolarguideError: focal lengths are not positive, or the skew is not small.
+        PolarguideError: focal lengths are not positive, or pixels are skewed.
     """
     lower = np.abs([inner[1, 0], inner[2, 0], inner[2, 1], inner[2, 2] - 1]).max()
     skew = abs(inner[0, 1]) / max(abs(inner[0, 0]), 1e-12)
@@ -390,7 +393,7 @@ def checked_intrinsics(where: object, inner: Matrix) -> Matrix:
 
 
 def checked_pose(where: object, matrix: Matrix) -> tuple[Matrix, Matrix]:
-    """Rotation and translation of a rigid [3 or 4, 4] matrix; rounding errors of the rotation are removed.
+    """Return rotation and translation of a rigid [3 or 4, 4] matrix, with an exactly orthogonal rotation.
 
     Raises:
         PolarguideError: the matrix is not rigid.
@@ -406,7 +409,7 @@ def checked_pose(where: object, matrix: Matrix) -> tuple[Matrix, Matrix]:
 def pinhole_camera(
     size: tuple[int, int], inner: Matrix, rotation: Matrix, translation: Matrix
 ) -> PosedCamera:
-    """A camera without distortion; ``inner`` counts pixels as COLMAP does."""
+    """Create a camera without distortion; ``inner`` is the intrinsic matrix in COLMAP's pixels."""
     parameters = (inner[0, 0], inner[1, 1], inner[0, 2], inner[1, 2])
     return PosedCamera(*size, "PINHOLE", tuple(float(p) for p in parameters), rotation, translation)
 
@@ -414,12 +417,12 @@ def pinhole_camera(
 def distorted_camera(
     where: object, size: tuple[int, int], inner: Matrix, coefficients: Any, pose: Sequence[Matrix]
 ) -> PosedCamera:
-    """A camera calibrated with OpenCV, with 4, 5 or 8 distortion coefficients.
+    """Create a camera from OpenCV's calibration with 4, 5 or 8 distortion coefficients.
 
-    OpenCV counts from the center of the top-left pixel, COLMAP from its corner: the principal point moves by half.
+    OpenCV's origin is the center of the top-left pixel, COLMAP's its corner. The principal point moves by half a pixel.
 
     Raises:
-        PolarguideError: there are other coefficients.
+        PolarguideError: the number of coefficients differs.
     """
     k = finite_numbers(where, np.ravel(np.asarray(coefficients)), ((4,), (5,), (8,)))
     padded = [*k, *[0.0] * (8 - len(k))]
@@ -432,7 +435,7 @@ def require_entries(path: Path, entries: Mapping[str, object], *keys: str) -> No
     """Check that a file has entries.
 
     Raises:
-        PolarguideError: one is missing.
+        PolarguideError: an entry is missing.
     """
     for key in keys:
         require_published(key in entries, path, f"the entry {key}", listed(sorted(entries)) or "no entry")

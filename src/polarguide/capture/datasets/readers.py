@@ -1,4 +1,4 @@
-"""PANDORA, NeRSP and their repacks: Stokes vectors with cameras of IDR, ``world_mat_<i>`` and ``scale_mat_<i>``."""
+"""Readers of published datasets: PANDORA, NeRSP, NeISF, GNeRP, PhyGaP and PISR."""
 
 from __future__ import annotations
 
@@ -22,7 +22,6 @@ from polarguide.capture.datasets.dataset import (
     distorted_camera,
     first_picture_size,
     masks_beside,
-    not_as_published,
     numbered_views,
     pinhole_camera,
     read_mask,
@@ -41,7 +40,7 @@ from polarguide.capture.formats.arrays import (
     finite_numbers,
     read_array,
     read_arrays,
-    read_exr_channels,
+    read_exr,
 )
 from polarguide.capture.formats.headers import LARGEST_PIXELS
 from polarguide.capture.formats.pictures import (
@@ -58,9 +57,10 @@ from polarguide.capture.view import FULL_CODE
 from polarguide.core.errors import PolarguideWarning
 from polarguide.core.files import read_file
 from polarguide.core.records import read_record
+from polarguide.core.text import number_or_nan
 
-# Names in the releases, and in the copies of NeRSP, PolGS and PhyGaP.
 STOKES_FOLDERS = ("images_stokes", "train_images_stokes")
+"""Folders of Stokes vectors in the releases and in the copies of NeRSP, PolGS and PhyGaP."""
 _PICTURES = ("image", "images", "train", "I-sum", "I_sum")
 _MAPS = ("input_azimuth_maps", "train_input_azimuth_maps")
 _PANDORA_PARTS = ("s0", "s0p1", "s0p2")
@@ -68,39 +68,38 @@ _PANDORA_STEM = re.compile(r"(?P<view>\d{1,6})_(?P<part>s0|s0p1|s0p2)")
 
 
 def open_pandora(root: Path) -> Dataset:
-    """Find the files of PANDORA, also as NeRSP and PolGS pack them, and read the cameras.
+    """Open PANDORA, also as NeRSP and PolGS distribute it.
 
     Raises:
-        PolarguideError: one is missing, or the cameras are invalid.
+        PolarguideError: a file is missing, or the cameras are invalid.
     """
-    folder = _folder(root, STOKES_FOLDERS)
+    folder = _first_path(root, STOKES_FOLDERS)
     cameras_file = root / "cameras.npz"
     matches = [_PANDORA_STEM.fullmatch(stem) for stem in index_files(folder, (".hdr",))]
     views = sorted({match["view"] for match in matches if match is not None})
     files = {view: [folder / f"{view}_{part}.hdr" for part in _PANDORA_PARTS] for view in views}
-    pictures = index_files(_folder(root, _PICTURES), SUFFIXES)
-    # Files count from 1, unless a file or a picture is called 00.
-    first = 0 if any(int(view) == 0 for view in views) or "00" in pictures else 1
+    pictures = index_files(_first_path(root, _PICTURES), SUFFIXES)
+    numbers = {view: int(view) for view in views}
+    # Files count from 1, unless a file or a picture has the name 00.
+    first = 0 if 0 in numbers.values() or "00" in pictures else 1
     cameras: dict[str, PosedCamera] | None = None
-    posed_by: Path | None = None
     notes: tuple[str, ...] = ()
-    # PhyGaP's copy has a COLMAP model in place of the cameras.
-    if cameras_file.exists() or not (root / "sparse").is_dir():
+    # PhyGaP's copy has a COLMAP model instead of the cameras.
+    posed = cameras_file.exists() or not (root / "sparse").is_dir()
+    if posed:
         offsets = (0,) if first == 0 else None
         light = files[views[0]][0] if views else None
-        by_number = {view: int(view) for view in views}
-        parts, numbers = _cameras(root, cameras_file, by_number, pictures, light, offsets)
-        cameras = cameras_of_views(cameras_file, numbers, parts, "world_mat_")
-        posed_by = cameras_file
-        shift = next(iter(numbers.values())) - int(next(iter(numbers))) if numbers else 0
-        notes = (f"Files count from {first}, cameras from {first + shift}.",)
-    masks, read = _masks(root, {view: int(view) for view in views}, first)
+        cameras, offset = _cameras(root, cameras_file, numbers, pictures, light, offsets)
+        notes = (f"Files count from {first}, cameras from {first + offset}.",)
+    masks, read_mask = _masks(root, numbers, first)
     return stokes_dataset(
-        "pandora", _PANDORA_PARTS, files, _stokes, posed_by, cameras, masks, read_mask=read, notes=notes
-    )
+        "pandora", _PANDORA_PARTS, files, cameras_file if posed else None, cameras, masks,
+        stokes=_stokes_of_sums, read_mask=read_mask, notes=notes,
+    )  # fmt: skip
 
 
-def _stokes(planes: NDArray[np.float32]) -> NDArray[np.float32]:
+def _stokes_of_sums(planes: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Convert S0, S0 + S1 and S0 + S2 to Stokes vectors."""
     total, plus1, plus2 = planes
     return np.asarray(np.stack([total, plus1 - total, plus2 - total]) / np.float32(2), np.float32)
 
@@ -111,69 +110,46 @@ _NERSP_CAMERAS = ("cameras.npz", "cameras_new.npz", "cameras_sphere.npz")
 
 
 def open_nersp(root: Path) -> Dataset:
-    """Find the files of NeRSP (SMVP3D, and RMVP3D with an archive a view), also as PolGS packs them, and the cameras.
+    """Open NeRSP (SMVP3D, and RMVP3D with an archive for each view), also as PolGS distributes it.
 
     Raises:
-        PolarguideError: one is missing, or the cameras are invalid.
+        PolarguideError: a file is missing, or the cameras are invalid.
     """
-    cameras_file = next(
-        (root / name for name in _NERSP_CAMERAS if (root / name).exists()), root / _NERSP_CAMERAS[0]
-    )
-    archives = index_files(_folder(root, STOKES_FOLDERS), (".npz",))
+    cameras_file = _first_path(root, _NERSP_CAMERAS)
+    archives = index_files(_first_path(root, STOKES_FOLDERS), (".npz",))
     stems = set(archives) or {stem for part in _NERSP_PARTS for stem in index_files(root / part, (".npy",))}
     views = numbered_views(stems)
-    pictures = index_files(_folder(root, _PICTURES), SUFFIXES)
+    pictures = index_files(_first_path(root, _PICTURES), SUFFIXES)
     light = None if archives else next(iter(sorted((root / _NERSP_PARTS[0]).glob("*.npy"))), None)
-    parts, numbers = _cameras(root, cameras_file, views, pictures, light, (0,))
-    cameras = cameras_of_views(cameras_file, numbers, parts, "world_mat_")
-    masks, read = _masks(root, views, 0)
+    cameras, _ = _cameras(root, cameras_file, views, pictures, light, (0,))
+    masks, read_mask = _masks(root, views, 0)
+    settings: dict[str, Any] = {
+        "stokes": _halved,
+        "read_mask": read_mask,
+        "sense": "cw",
+        "sense_known": False,
+    }
     if archives:
-        return _archived(archives, cameras_file, cameras, masks, read)
+        stored = {view: [archives[view]] for view in views}
+        return stokes_dataset(
+            "nersp", ("archive",), stored, cameras_file, cameras, masks, read=_read_archive, **settings
+        )
     files = {view: [root / part / f"{view}.npy" for part in _NERSP_PARTS] for view in views}
-    return stokes_dataset(
-        "nersp", _NERSP_PARTS, files, _halved, cameras_file, cameras, masks,
-        read_mask=read, sense="cw", sense_known=False,
-    )  # fmt: skip
+    return stokes_dataset("nersp", _NERSP_PARTS, files, cameras_file, cameras, masks, **settings)
 
 
 def _halved(planes: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Convert Stokes vectors to the scale of S0 / 2."""
     return planes / np.float32(2)
 
 
-def _archived(
-    archives: Mapping[str, Path],
-    cameras_file: Path,
-    cameras: Mapping[str, PosedCamera],
-    masks: Mapping[str, Path],
-    read: Callable[[Path], NDArray[np.bool_]],
-) -> Dataset:
-    """RMVP3D: an archive with S0, S1 and S2 for each view."""
-    files = {view: archives[view] for view in cameras}
-
-    def read_stokes(view: str) -> StokesImage:
-        stokes = _halved(_read_archive(files[view]))
-        return stokes, np.zeros(stokes.shape[1:3], bool)
-
-    return Dataset(
-        name="nersp",
-        views=sorted(files),
-        paths=[*files.values(), *masks.values(), cameras_file],
-        files=files,
-        cameras=cameras,
-        read_stokes=read_stokes,
-        masks=masks,
-        read_mask=read,
-        sense="cw",
-        sense_known=False,
-    )
-
-
-def _read_archive(path: Path) -> NDArray[np.float32]:
-    """Stokes vectors [3, H, W, 3] from the entries S0, S1 and S2 of an archive.
+def _read_archive(paths: Sequence[Path]) -> NDArray[np.float32]:
+    """Read Stokes vectors [3, H, W, 3] from the entries S0, S1 and S2 of an archive, RMVP3D's file of a view.
 
     Raises:
         PolarguideError: the file cannot be read, lacks an entry, or its entries are no pictures of one size.
     """
+    (path,) = paths
     arrays = decode_arrays(path, read_file(path), _NERSP_ENTRIES, 3 * 8 * 3 * LARGEST_PIXELS, kinds="biufcSU")
     require_entries(path, arrays, *_NERSP_ENTRIES)
     for key in _NERSP_ENTRIES:
@@ -188,9 +164,9 @@ def _read_archive(path: Path) -> NDArray[np.float32]:
     return np.stack([arrays[key] for key in _NERSP_ENTRIES]).astype(np.float32)
 
 
-def _folder(root: Path, names: tuple[str, ...]) -> Path:
-    """The first of the folders that there is."""
-    return next((root / name for name in names if (root / name).is_dir()), root / names[0])
+def _first_path(root: Path, names: Sequence[str]) -> Path:
+    """Return the first existing path of several names, or that of the first name."""
+    return next((root / name for name in names if (root / name).exists()), root / names[0])
 
 
 def _cameras(
@@ -200,24 +176,27 @@ def _cameras(
     pictures: Mapping[str, Path],
     light: Path | None,
     offsets: tuple[int, ...] | None,
-) -> tuple[dict[int, PosedCamera], dict[str, int]]:
-    """Cameras by their number, and the number of each view's camera.
+) -> tuple[dict[str, PosedCamera], int]:
+    """Read the cameras by view, and the offset from a view's number to that of its camera.
 
-    Cameras count from 0 (``world_mat_0``), or as the releases of PANDORA and PolGS's copies do, from 1
-    (``world_mat_01``). No view ever gets the camera of another because one was removed: a way of counting is chosen by
-    where the numbers of the cameras begin, and holds only if it gives every view a camera.
+    Numbers of cameras start at 0 (``world_mat_0``), or at 1 (``world_mat_01``) in the releases of PANDORA and the
+    copies of PolGS. The first number decides. An offset must give every view a camera, so that a removed camera does
+    not shift all others.
 
     Args:
-        root, path: the dataset and the file of its cameras.
-        views: view -> number of its files.
-        pictures: what the intrinsics were made for.
-        light: a file of Stokes vectors, whose size the cameras have if the pictures were resized later.
-        offsets: of cameras' numbers from those of files that count from 0; None for files that count from 1.
+        root: folder of the dataset.
+        path: file of the cameras.
+        views: number of each view's files.
+        pictures: pictures of the intrinsics.
+        light: a file of Stokes vectors. The cameras have its size if the pictures were resized later.
+        offsets: possible offsets for files that count from 0; None for files that count from 1.
     """
     projections = read_projections(path)
     known = projections.cameras
-    size = first_picture_size(pictures, _folder(root, _PICTURES)) if views else (1, 1)
-    size = _size_of(path, [inner for inner, *_ in known.values()], size, light) if views else size
+    size = (1, 1)
+    if views:
+        size = first_picture_size(pictures, _first_path(root, _PICTURES))
+        size = _camera_size(path, [inner for inner, *_ in known.values()], size, light)
     if offsets is None:
         offsets = (-1,) if 0 in known else (0, -1)
     elif projections.padded and 0 not in known and "00" not in pictures:
@@ -227,16 +206,18 @@ def _cameras(
         offsets[-1],
     )
     cameras = {number: pinhole_camera(size, *camera) for number, camera in known.items()}
-    return cameras, {view: number + chosen for view, number in views.items()}
+    numbers = {view: number + chosen for view, number in views.items()}
+    return cameras_of_views(path, numbers, cameras, "world_mat_"), chosen
 
 
-def _size_of(path: Path, inner: Sequence[NDArray[np.float64]], size: Size, light: Path | None) -> Size:
-    """The size that cameras were made for: of the pictures, or of the Stokes vectors if those were resized later.
+def _camera_size(path: Path, inner: Sequence[NDArray[np.float64]], size: Size, light: Path | None) -> Size:
+    """Return the size that cameras refer to: of the pictures, or of the Stokes vectors if pictures were resized later.
 
     Args:
-        path: their file, for messages.
-        inner: their intrinsics.
-        size: size of the pictures. light: a file of Stokes vectors.
+        path: file of the cameras for messages.
+        inner: intrinsic matrices of the cameras.
+        size: size of the pictures.
+        light: a file of Stokes vectors.
     """
     centers = [(float(matrix[0, 2]), float(matrix[1, 2])) for matrix in inner]
     other = None if light is None else stated_size(light)
@@ -244,8 +225,8 @@ def _size_of(path: Path, inner: Sequence[NDArray[np.float64]], size: Size, light
         if all(is_centered(candidate, center) for center in centers):
             return candidate
     warnings.warn(
-        f"{path.name}: principal points lie far from the middle of the pictures, {size[0]}x{size[1]}, as "
-        "those of pictures that were cropped or resized do. The size is taken as it is.",
+        f"{path.name}: principal points are far from the middle of the pictures, {size[0]}x{size[1]}. This is a sign "
+        "of cropped or resized pictures. Their size is used nevertheless.",
         PolarguideWarning,
         stacklevel=2,
     )
@@ -255,23 +236,25 @@ def _size_of(path: Path, inner: Sequence[NDArray[np.float64]], size: Size, light
 def _masks(
     root: Path, views: Mapping[str, int], first: int
 ) -> tuple[dict[str, Path], Callable[[Path], NDArray[np.bool_]]]:
-    """Object masks by view and what reads them: ``mask/`` or ``masks/``, else the alpha of NeRSP's azimuth maps.
+    """Find the foreground masks by view, and the function that reads them.
+
+    They are in ``mask/`` or ``masks/``, else in the last channel of NeRSP's azimuth maps.
 
     Args:
-        root: the dataset.
-        views: view -> its number.
-        first: the number that they count from; maps count from 0.
+        root: folder of the dataset.
+        views: numbers of the views by name.
+        first: first number of the files; maps count from 0.
     """
-    maps = index_files(_folder(root, _MAPS), (".png",))
+    maps = index_files(_first_path(root, _MAPS), (".png",))
     if not maps:
         return masks_beside(root, views), read_mask
-    by_index = {int(stem): path for stem, path in maps.items() if stem.isascii() and stem.isdigit()}
+    by_index = {number: maps[stem] for stem, number in numbered_views(set(maps)).items()}
     indices = {view: number - first for view, number in views.items()}
     return {view: by_index[index] for view, index in indices.items() if index in by_index}, _last_channel
 
 
 def _last_channel(path: Path) -> NDArray[np.bool_]:
-    """The mask that NeRSP's azimuth maps have in their last channel."""
+    """Read the mask in the last channel of NeRSP's azimuth maps."""
     pixels = decode_stored(path, read_picture(path))
     return np.asarray((pixels if pixels.ndim == 2 else pixels[..., -1]) > 0)
 
@@ -281,10 +264,10 @@ _NEISF_STEM = re.compile(r"img_(\d{1,6})")
 
 
 def open_neisf(root: Path) -> Dataset:
-    """Find the files and read the cameras.
+    """Open NeISF.
 
     Raises:
-        PolarguideError: one is missing, or the cameras are invalid.
+        PolarguideError: a file is missing, or the cameras are invalid.
     """
     matches = [
         _NEISF_STEM.fullmatch(stem) for part in _NEISF_PARTS for stem in index_files(root / part, (".exr",))
@@ -294,13 +277,11 @@ def open_neisf(root: Path) -> Dataset:
     cameras_file = root / "poses_bounds.npy"
     cameras = cameras_of_views(cameras_file, numbers, _llff_cameras(cameras_file), "row ")
     masks = masks_beside(root, numbers)
-    return stokes_dataset(
-        "neisf", _NEISF_PARTS, files, lambda planes: planes, cameras_file, cameras, masks, sense_known=False
-    )
+    return stokes_dataset("neisf", _NEISF_PARTS, files, cameras_file, cameras, masks, sense_known=False)
 
 
 def _llff_cameras(path: Path) -> dict[int, PosedCamera]:
-    """Row -> camera; rows count from 1 like the files."""
+    """Read the cameras of LLFF by row; rows count from 1 like the files."""
     rows = read_array(path)
     require_published(
         rows.ndim == 2 and rows.shape[1] == 17 and len(rows),
@@ -319,7 +300,7 @@ def _llff_cameras(path: Path) -> dict[int, PosedCamera]:
             "height, width and focal length in pixels",
             f"{height:g}, {width:g} and {focal:g}",
         )
-        # OpenCV's axes: right, down, forward.
+        # Axes of OpenCV: right, down, forward.
         axes = np.column_stack([np.stack([right, down, -back]), np.zeros(3)])
         rotation, _ = checked_pose(where, axes)
         middle = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
@@ -332,14 +313,14 @@ _SHAPES = ((3, 4), (4, 4))
 
 
 def open_gnerp(root: Path, *, transfer: str) -> Dataset:
-    """Find the files and read the cameras.
+    """Open GNeRP.
 
     Args:
-        root: the folder.
-        transfer: how the pictures are encoded: "linear", "srgb", or "auto", which takes "srgb".
+        root: folder of the dataset.
+        transfer: encoding of the pictures: "linear", "srgb", or "auto" for "srgb".
 
     Raises:
-        PolarguideError: one is missing, or the cameras are invalid.
+        PolarguideError: a file is missing, or the cameras are invalid.
     """
     transfer = "srgb" if transfer == "auto" else transfer
     pictures = index_files(root / "images", SUFFIXES)
@@ -356,10 +337,10 @@ def open_gnerp(root: Path, *, transfer: str) -> Dataset:
     def read_stokes(view: str) -> StokesImage:
         stored = decode_picture(pictures[view], read_picture(pictures[view]))
         aop, dop = (_plane(files[view], stored.shape, pictures[view]) for files in (angles, degrees))
-        if (largest := float(np.nanmax(np.abs(aop)))) > 2 * math.pi:
-            raise not_as_published(angles[view], "angles in radians", f"up to {largest:g}")
-        if (middle := float(np.nanmedian(dop))) > 1:
-            raise not_as_published(degrees[view], "degrees from 0 to 1", f"a median of {middle:g}")
+        largest = float(np.nanmax(np.abs(aop)))
+        require_published(not largest > 2 * math.pi, angles[view], "angles in radians", f"up to {largest:g}")
+        middle = float(np.nanmedian(dop))
+        require_published(not middle > 1, degrees[view], "degrees from 0 to 1", f"a median of {middle:g}")
         s0 = 2 * linear_codes(stored, transfer).astype(np.float32) / np.float32(FULL_CODE)
         stokes = [s0, s0 * (dop * np.cos(2 * aop))[..., None], s0 * (dop * np.sin(2 * aop))[..., None]]
         return np.stack(stokes), np.asarray((stored == np.iinfo(stored.dtype).max).any(axis=2))
@@ -374,16 +355,16 @@ def open_gnerp(root: Path, *, transfer: str) -> Dataset:
         read_stokes=read_stokes,
         masks=masks,
         notes=(
-            "AoP and DoP have one channel and are shared by R, G and B.",
-            f"The pictures were taken as {transfer}"
-            + (" and made linear before Stokes vectors were formed (--transfer says otherwise)."
+            "AoP and DoP have one channel, which R, G and B share.",
+            f"The pictures are read as {transfer}"
+            + (" and made linear before Stokes vectors are computed (change with --transfer)."
                if transfer == "srgb" else "."),
         ),
     )  # fmt: skip
 
 
 def _plane(path: Path, shape: tuple[int, ...], like: Path) -> NDArray[np.float32]:
-    """Numbers [H, W] from a file with [H, W] or [H, W, 1]."""
+    """Read numbers [H, W] from a file with [H, W] or [H, W, 1]."""
     plane = read_array(path)
     if plane.ndim == 3 and plane.shape[2] == 1:
         plane = plane[..., 0]
@@ -401,7 +382,7 @@ _GNERP_ENTRY = re.compile(r"w2c_mat_\d{1,6}|intrinsic(_\d{1,6})?")
 
 
 def _gnerp_cameras(path: Path, size: tuple[int, int]) -> dict[int, PosedCamera]:
-    """Number -> camera, from ``w2c_mat_<i>`` and ``intrinsic``, or ``intrinsic_<i>`` where there is one."""
+    """Read cameras by number, from ``w2c_mat_<i>`` and ``intrinsic_<i>`` with ``intrinsic`` as default."""
     content: dict[str, Any] = read_record(path, dict[str, Any])
     cameras = {}
     for key, value in content.items():
@@ -421,22 +402,19 @@ def _gnerp_cameras(path: Path, size: tuple[int, int]) -> dict[int, PosedCamera]:
 
 
 PHYGAP_CAMERAS = "camera_params.npz"
-# The angle of view says again what the intrinsics and the size say.
 _PHYGAP_ENTRIES = {"intrinsics", "extrinsics", "image_width", "image_height", "fov"}
-_CHANNELS = tuple(tuple(f"S{part}.{color}" for color in "RGB") for part in range(3))
+"""Known entries. The angle of view is redundant."""
+_CHANNELS = tuple(f"S{part}.{color}" for part in range(3) for color in "RGB")
 
 
 def open_phygap(root: Path) -> Dataset:
-    """Find the files and read the cameras.
+    """Open PhyGaP.
 
     Raises:
-        PolarguideError: one is missing, or the cameras are invalid.
+        PolarguideError: a file is missing, or the cameras are invalid.
     """
-    folder = next(
-        (root / name for name in ("images_full", "images") if (root / name).is_dir()), root / "images_full"
-    )
-    files = index_files(folder, (".exr",))
-    numbers = numbered_views(set(files))
+    stored = index_files(_first_path(root, ("images_full", "images")), (".exr",))
+    numbers = numbered_views(set(stored))
     path = root / PHYGAP_CAMERAS
     arrays = read_arrays(path)
     require_entries(path, arrays, "intrinsics", "extrinsics", "image_width", "image_height")
@@ -460,46 +438,45 @@ def open_phygap(root: Path) -> Dataset:
     cameras = {}
     for number, pose in enumerate(poses):
         where = f"{path} (extrinsics {number})"
-        rigid = checked_pose(where, finite_numbers(where, pose, ((3, 4), (4, 4))))
+        rigid = checked_pose(where, finite_numbers(where, pose, _SHAPES))
         cameras[number] = pinhole_camera(size, inner, *rigid)
 
-    def read_stokes(view: str) -> StokesImage:
-        s0, s1, s2 = read_exr_channels(files[view], _CHANNELS)
-        stokes: Any = np.stack([s0, -s1, -s2])
-        return stokes, np.zeros(s0.shape[:2], bool)
-
-    masks = masks_beside(root, numbers)
-    return Dataset(
-        name="phygap",
-        views=sorted(numbers),
-        paths=[*(files[view] for view in numbers), *masks.values(), path],
-        files={view: files[view] for view in numbers},
-        cameras=cameras_of_views(path, numbers, cameras, "extrinsics "),
-        read_stokes=read_stokes,
-        masks=masks,
-        notes=("Angles of Mitsuba count from the vertical of the picture: turned by 90 degrees.",),
+    return stokes_dataset(
+        "phygap",
+        ("Stokes vectors",),
+        {view: [stored[view]] for view in numbers},
+        path,
+        cameras_of_views(path, numbers, cameras, "extrinsics "),
+        masks_beside(root, numbers),
+        read=_read_mitsuba,
+        notes=("Angles of Mitsuba start at the vertical of the picture: turned by 90 degrees.",),
     )
 
 
+def _read_mitsuba(paths: Sequence[Path]) -> NDArray[np.float32]:
+    """Read Stokes vectors [3, H, W, 3] of Mitsuba, whose angles start at the vertical of the picture."""
+    (path,) = paths
+    s0, s1, s2 = np.split(read_exr(path, _CHANNELS), 3, axis=2)
+    return np.stack([s0, -s1, -s2])
+
+
 PISR_SENSOR: Final = "IMX250MYR"
-# Size that ``camera_matrix`` was made for.
 _PISR_SIZE = (1224, 1024)
-# Poses of the calibration target and its error, which OpenCV returns with them, are of no picture here.
+"""Picture size of ``camera_matrix``."""
+# Known entries. Poses of the calibration target and the error are results of OpenCV that are not needed.
 _PISR_ENTRIES = {"camera_matrix", "dist_coeffs", "rvecs", "tvecs", "ret", "rms"}
 _PISR_CAMERAS = ("cameras_sphere.npz", "cameras.npz")
 
 
 def open_pisr(root: Path) -> Dataset:
-    """Find the files and read the cameras.
+    """Open PISR.
 
     Raises:
-        PolarguideError: one is missing, or the cameras are invalid.
+        PolarguideError: a file is missing, or the cameras are invalid.
     """
     files = index_files(root / "raw", (".npy",))
     numbers = numbered_views(set(files))
-    cameras_file = next(
-        (root / name for name in _PISR_CAMERAS if (root / name).exists()), root / _PISR_CAMERAS[0]
-    )
+    cameras_file = _first_path(root, _PISR_CAMERAS)
     inner_file = root / "intrinsics.npz"
     intrinsics = read_arrays(inner_file)
     require_entries(inner_file, intrinsics, "camera_matrix", "dist_coeffs")
@@ -512,12 +489,13 @@ def open_pisr(root: Path) -> Dataset:
         for number, (_, *pose) in read_projections(cameras_file).cameras.items()
     }
     masks = masks_beside(root, numbers)
-    gamma = _gamma(root)
-    note = f"Stored values are the light to the power of {gamma:g} (gamma file): undone."
+    gamma_files = sorted(path for path in root.iterdir() if path.name.startswith("gamma"))
+    gamma = _gamma(root, gamma_files)
+    note = f"Stored values are the light to the power of {gamma:g} (gamma file), which is undone."
     return Dataset(
         name="pisr",
         views=sorted(numbers),
-        paths=[*files.values(), *masks.values(), inner_file, cameras_file, *_gamma_files(root)],
+        paths=[*files.values(), *masks.values(), inner_file, cameras_file, *gamma_files],
         files=files,
         cameras=cameras_of_views(cameras_file, numbers, cameras, "world_mat_"),
         read_stokes=None,
@@ -528,19 +506,11 @@ def open_pisr(root: Path) -> Dataset:
     )
 
 
-def _gamma_files(root: Path) -> list[Path]:
-    return sorted(path for path in root.iterdir() if path.name.startswith("gamma"))
-
-
-def _gamma(root: Path) -> float:
-    """The number in the name of the gamma file; 1 without one."""
-    files = _gamma_files(root)
+def _gamma(root: Path, files: Sequence[Path]) -> float:
+    """Return the number in the name of the gamma file; 1 without a file."""
     if not files:
         return 1.0
-    try:
-        gamma = float(files[0].name.removeprefix("gamma").removesuffix(".txt"))
-    except ValueError:
-        gamma = math.nan
+    gamma = number_or_nan(files[0].name.removeprefix("gamma").removesuffix(".txt"))
     require_published(
         len(files) == 1 and 0.2 <= gamma <= 5,
         root,
@@ -558,14 +528,16 @@ DATASETS: dict[str, tuple[tuple[str, ...], Callable[..., Dataset]]] = {
     "phygap": ((PHYGAP_CAMERAS,), open_phygap),
     "pandora": ((), open_pandora),
 }
-"""By name: the files and folders that a folder with the layout has, and the function that opens it. What lies in
-``images_stokes/`` tells PANDORA from RMVP3D.
+"""Datasets by name: the files and folders of its layout, and the function that opens it.
+
+The files in ``images_stokes/`` tell PANDORA from RMVP3D.
 """
 
 
 def detect_dataset(root: Path) -> str | None:
-    """The dataset whose layout a folder has, or None."""
-    for folder in (root / name for name in STOKES_FOLDERS if (root / name).is_dir()):
+    """Return the name of the dataset whose layout a folder has, or None."""
+    folder = _first_path(root, STOKES_FOLDERS)
+    if folder.is_dir():
         archived = any(path.suffix.lower() == ".npz" for path in folder.iterdir())
         return "nersp" if archived else "pandora"
     for name, (parts, _) in DATASETS.items():
@@ -577,15 +549,15 @@ def detect_dataset(root: Path) -> str | None:
 
 
 def open_dataset(root: Path, name: str, *, transfer: str = "auto") -> Dataset:
-    """A folder of the dataset called ``name``.
+    """Open a folder of a dataset.
 
     Args:
-        root: the folder.
+        root: folder of the dataset.
         name: a key of ``DATASETS``.
-        transfer: encoding of GNeRP's pictures; ignored for the others.
+        transfer: encoding of GNeRP's pictures; other datasets ignore it.
 
     Raises:
         PolarguideError: a file is missing, or the cameras are invalid.
     """
-    _, opened = DATASETS[name]
-    return opened(root, transfer=transfer) if opened is open_gnerp else opened(root)
+    _, open_files = DATASETS[name]
+    return open_files(root, transfer=transfer) if open_files is open_gnerp else open_files(root)

@@ -1,8 +1,8 @@
-"""Files of cameras: developed camera raw, and what files state beside their pixels (EXIF, the color profile).
+"""Files of cameras: developed camera raw, and metadata of exposures (EXIF).
 
-Camera raw becomes linear pictures with the same processing for every shot. LibRaw (package rawpy) runs without any step
-that depends on the picture: no automatic brightness, white level or white balance, no gamma, no color matrix. The
-remaining steps are the same for every shot: black level, fixed gains, a linear scale and demosaicing.
+LibRaw (package rawpy) develops camera raw to linear pictures. All steps that depend on the picture are disabled:
+automatic brightness, white level and white balance, gamma, and color matrix. The other steps are equal for every shot:
+black level, fixed gains, a linear scale and demosaicing.
 """
 
 from __future__ import annotations
@@ -38,13 +38,13 @@ from polarguide.core.files import read_file
 from polarguide.core.text import listed
 
 CAMERA_RAW = (".dng", ".nef", ".nrw", ".cr2", ".cr3", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw")
-"""Suffixes that are read as camera raw."""
+"""Suffixes of camera raw files."""
 _FULL = 65535
 _EXIF_OF_FLIP = {0: 1, 3: 3, 5: 8, 6: 6}
 
 
 def is_camera_raw(path: Path) -> bool:
-    """Whether a file is a camera raw file, by its suffix."""
+    """Return True if the suffix of a file is that of camera raw."""
     return path.suffix.lower() in CAMERA_RAW
 
 
@@ -55,11 +55,12 @@ def read_camera_raw(
 
     Args:
         path: the file.
-        gains: of R, G and B; the smallest becomes 1, so that full scale of the sensor is full scale of the picture.
-        opener: takes the file's bytes and returns what ``rawpy.imread`` would; rawpy itself if None.
+        gains: gains of R, G and B. They are divided by the smallest one, so full scale of the sensor is full scale of
+            the picture.
+        opener: replacement of ``rawpy.imread``, called with the file's content; None for rawpy.
 
     Returns:
-        [H, W, 3] linear RGB in the camera's own colors, not turned; and the EXIF orientation, 1 to 8.
+        Linear RGB [H, W, 3] in the camera's own colors, as stored; and the EXIF orientation, 1 to 8.
 
     Raises:
         PolarguideError: rawpy is missing, or the file cannot be read or is damaged.
@@ -67,12 +68,12 @@ def read_camera_raw(
     with _opened(path, opener) as raw:
         if raw.sizes.raw_width * raw.sizes.raw_height > LARGEST_PIXELS:
             raise ValueError(f"{raw.sizes.raw_width}x{raw.sizes.raw_height} pixels")
-        flip = int(raw.sizes.flip)  # before user_flip takes its place
+        flip = int(raw.sizes.flip)  # user_flip overwrites it
         pixels = np.asarray(raw.postprocess(**libraw_parameters(gains)))
         reached = float(_FULL)
         if raw.raw_type.name == "Stack":
-            # In a file that is not a mosaic (linear DNG, such as ProRAW of a telephone), LibRaw subtracts the black
-            # levels of three channels from the samples. From the white level it subtracts that of a fourth one, 0.
+            # In files without a mosaic (linear DNG, such as ProRAW), LibRaw subtracts the black levels of three
+            # channels from the samples, but the black level of a fourth channel, 0, from the white level.
             black = raw.black_level_per_channel
             reached = float((raw.white_level - max(black[:3])) / (raw.white_level - min(black)) * _FULL)
     if pixels.ndim != 3 or pixels.shape[2] != 3 or pixels.dtype != np.uint16:
@@ -82,7 +83,7 @@ def read_camera_raw(
             found=array_kind(pixels),
             remedy="Develop it to 16-bit linear TIFF.",
         )
-    # The white level becomes 65535, as saturation in the camera has to be known. LibRaw rounds down.
+    # The white level becomes 65535, which marks saturation. LibRaw rounds down.
     if reached < _FULL:
         pixels = np.minimum(np.rint(pixels * np.float32(_FULL / reached)), _FULL).astype(np.uint16)
     pixels = np.where(pixels >= _FULL - 1, np.uint16(_FULL), pixels)
@@ -90,7 +91,7 @@ def read_camera_raw(
 
 
 def stored_frame(path: Path) -> tuple[tuple[int, int], int]:
-    """Width and height of the pixels of a camera raw file as stored, and its EXIF orientation; nothing is developed.
+    """Return width and height of the stored pixels of a camera raw file, and its EXIF orientation, without development.
 
     Raises:
         PolarguideError: rawpy is missing, or the file cannot be read.
@@ -101,41 +102,41 @@ def stored_frame(path: Path) -> tuple[tuple[int, int], int]:
 
 @contextlib.contextmanager
 def _opened(path: Path, opener: Callable[[io.BytesIO], Any] | None = None) -> Iterator[Any]:
-    """A camera raw file as rawpy opens it; whatever goes wrong with it, then and inside, is the file's fault.
+    """Open a camera raw file with rawpy; any error inside the context is a fault of the file.
 
     Raises:
-        PolarguideError: rawpy is missing, or something did.
+        PolarguideError: rawpy is missing, or the file cannot be read or developed.
     """
     opened = opener or optional_import("rawpy", str(path)).imread
     data = read_file(path)
     try:
         with opened(io.BytesIO(data)) as raw:
             yield raw
-    except Exception as error:  # LibRaw's errors have a class each; damaged files raise others, too
+    except Exception as error:  # LibRaw has many classes of errors, and damaged files raise others
         raise PolarguideError(
             path,
             expected="a complete camera raw file",
-            found="an empty file" if not data else f"one that cannot be developed ({_words(error)})",
+            found="an empty file" if not data else f"a file that cannot be developed ({_message(error)})",
             remedy="Copy the file again, or develop it to 16-bit linear TIFF.",
         ) from error
 
 
-def _words(error: Exception) -> str:
-    """LibRaw's error message, which may be bytes, as one line."""
+def _message(error: Exception) -> str:
+    """Return LibRaw's error message, which may be bytes, as one line."""
     reason = error.args[0] if error.args else ""
     text = reason.decode(errors="replace") if isinstance(reason, bytes) else str(reason)
     return (text.strip().splitlines() or [type(error).__name__])[0]
 
 
 def libraw_parameters(gains: tuple[float, float, float]) -> dict[str, Any]:
-    """LibRaw's settings, by the names of ``rawpy.Params``."""
+    """Return LibRaw's settings by the names of ``rawpy.Params``."""
     red, green, blue = (gain / min(gains) for gain in gains)
     settings: dict[str, Any] = {
         "gamma": (1.0, 1.0),
         "output_bps": 16,
         "no_auto_bright": True,
         "bright": 1.0,
-        # Otherwise the white level follows the brightest pixel of each shot.
+        # Other values adapt the white level to the brightest pixel of each shot.
         "adjust_maximum_thr": 0.0,
         "use_camera_wb": False,
         "use_auto_wb": False,
@@ -158,7 +159,7 @@ _MIRRORED = (2, 4, 5, 7)
 QUARTER_TURNS = (5, 6, 7, 8)
 """Orientations that exchange width and height."""
 INVERSE = {code: {6: 8, 8: 6}.get(code, code) for code in range(1, 9)}
-"""The orientation that takes another one back."""
+"""Inverse of each orientation."""
 TURNS = {
     2: "mirrored left to right",
     3: "turned by 180 degrees",
@@ -168,13 +169,13 @@ TURNS = {
     7: "mirrored along the rising diagonal",
     8: "turned by 90 degrees counter-clockwise",
 }
-"""What each orientation but 1 does to the stored picture for display."""
+"""Change of the stored picture for display by each orientation but 1."""
 
 
 def orientation(data: bytes) -> int:
-    """The orientation tag of a picture file, 1 to 8; 1 (as stored) where there is none that can be read.
+    """Return the orientation tag of a picture file, 1 to 8; 1 (as stored) without a valid tag.
 
-    HEIC states its turn in the header; its tag is for information only.
+    HEIC states its rotation in the header; its tag is informative only.
     """
     if picture_kind(data) == "HEIF":
         head = heif_head(data)
@@ -184,7 +185,7 @@ def orientation(data: bytes) -> int:
 
 
 def apply_orientation(pixels: NDArray[Any], code: int) -> NDArray[Any]:
-    """Pixels [H, W, ...] rotated or mirrored for display, given the orientation tag."""
+    """Rotate or mirror pixels [H, W, ...] for display by an orientation tag."""
     if code in (5, 7):
         pixels = pixels.swapaxes(0, 1)
         return np.rot90(pixels, 2) if code == 7 else pixels
@@ -194,29 +195,26 @@ def apply_orientation(pixels: NDArray[Any], code: int) -> NDArray[Any]:
 
 
 def orientation_calibration(code: int) -> Calibration:
-    """The change of polarizer angles when the stored picture is rotated or mirrored for display."""
+    """Return the change of polarizer angles when the stored picture is rotated or mirrored for display."""
     return Calibration(
         sense="cw" if code in _MIRRORED else "ccw", zero=90.0 if code in QUARTER_TURNS else 0.0
     )
 
 
 def tags_of(data: bytes) -> dict[int, Any]:
-    """The EXIF tags of a picture file and of camera raw that is built like TIFF; none where they are damaged.
-
-    Pillow reads tags only: of pictures with 16 bits a channel it would return 8.
-    """
+    """Return the EXIF tags of a picture file or a TIFF-like camera raw file; empty if they are damaged."""
     exif = Image.Exif()
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             exif.load(_block_of_tags(data))
             return {**exif, **exif.get_ifd(_DIRECTORY)}
-    except Exception:  # Pillow raises a dozen kinds for tags that are damaged, and promises none
+    except Exception:  # Pillow raises many undocumented classes for damaged tags
         return {}
 
 
 def _block_of_tags(data: bytes) -> bytes:
-    """The EXIF block of a picture file, which is built like a TIFF file; empty where it has none."""
+    """Return the EXIF block of a picture file, which has the format of TIFF; empty without EXIF."""
     block = data
     kind = picture_kind(data)
     if kind in ("JPEG", "WebP"):
@@ -236,36 +234,44 @@ _TIME = 33434
 _F_NUMBER = 33437
 _ISO = 34855
 _ISO_TOO_LARGE = 65535
-"""Value of the tag ISO where its 16 bits are too few."""
+"""Value of the tag ISO for values of more than 16 bits."""
 _LARGER_ISO = (34866, 34865, 34867)
-"""Tags with the ISO then: recommended exposure index, standard output sensitivity, ISO speed (EXIF 2.3)."""
+"""Tags with larger ISO values: recommended exposure index, standard output sensitivity, ISO speed (EXIF 2.3)."""
 _FOCAL_LENGTH = 37386
 _FOCAL_LENGTH_OF_FILM = 41989
 _SERIAL_NUMBER = 42033
 _LENS = 42036
 _DIGITAL_ZOOM = 41988
+_FOCAL_AGREES = 0.01
+"""Relative tolerance of equal focal lengths: tags are rounded, and focus changes the focal length."""
 
 
 @dataclass(frozen=True)
 class Lens:
-    """The camera and the lens of a picture, as far as its file states them.
+    """Camera and lens of a picture, as far as its file states them.
 
     Attributes:
-        camera: in words. focal: focal length, in a unit that pictures of one ``camera`` share; None: not known.
+        camera: text that identifies the camera.
+        focal: focal length, in a unit that pictures of one ``camera`` share; None if unknown.
     """
 
     camera: str
     focal: float | None = None
 
+    def agrees(self, other: Lens) -> bool:
+        """Return True if the camera is equal and the focal length at most slightly larger, or unknown."""
+        close = not self.focal or not other.focal or self.focal < (1 + _FOCAL_AGREES) * other.focal
+        return self.camera == other.camera and close
+
 
 @dataclass(frozen=True)
 class ExposureData:
-    """How a photograph was taken, as its file says; None for what it does not say, or not plausibly.
+    """Exposure of a photograph, as its file states it; None for missing and implausible values.
 
     Attributes:
-        camera: maker and model; empty where it does not say.
-        lens: body and lens, with the focal length in mm of the 35 mm film, else as it is.
-        seconds, iso, f_number: of the exposure.
+        camera: maker and model; empty if missing.
+        lens: body and lens, with the focal length in mm of the 35 mm film, else the actual one.
+        seconds, iso, f_number: exposure time, sensitivity and aperture.
     """
 
     camera: str = ""
@@ -276,9 +282,9 @@ class ExposureData:
 
     @property
     def light(self) -> float | None:
-        """How much light was let in and how it was amplified: seconds * ISO / f-number^2; None without a time.
+        """Exposure, seconds * ISO / f-number^2; None without a time.
 
-        Comparable among files that say the same of the three: ISO and f-number count as 100 and 1 where none does.
+        Missing ISO and f-number count as 100 and 1, so values are comparable among files with the same tags.
         """
         return (
             None if self.seconds is None else self.seconds * (self.iso or 100.0) / (self.f_number or 1.0) ** 2
@@ -288,20 +294,20 @@ class ExposureData:
 _NAMES = {"seconds": "ExposureTime", "iso": "ISO", "f_number": "FNumber"}
 
 
-def missing_tags(taken: Mapping[Path, ExposureData]) -> str:
-    """A sentence where some files do not say what others say of their exposure; "" where they are comparable."""
+def missing_tags(exposures: Mapping[Path, ExposureData]) -> str:
+    """Return a warning if some files lack a tag of the exposure that others have; "" if exposures are comparable."""
     for field, name in _NAMES.items():
-        without = [path.name for path, data in taken.items() if getattr(data, field) is None]
-        if 0 < len(without) < len(taken):
+        without = [path.name for path, data in exposures.items() if getattr(data, field) is None]
+        if 0 < len(without) < len(exposures):
             return (
-                f"{len(without)} of {len(taken)} files have no {name} in their EXIF tags ({listed(without)}), and the "
-                "others have: EXIF corrects no exposure."
+                f"{len(without)} of {len(exposures)} files have no {name} in their EXIF tags ({listed(without)}). "
+                "Exposures are not corrected by EXIF."
             )
     return ""
 
 
 def read_exposure_data(path: Path) -> ExposureData:
-    """Exposure data of a file: EXIF of pictures and of camera raw that is built like TIFF; else LibRaw.
+    """Read the exposure data of a file: EXIF of pictures and TIFF-like camera raw; else LibRaw.
 
     Raises:
         PolarguideError: the file cannot be read, or LibRaw is needed and missing.
@@ -312,15 +318,15 @@ def read_exposure_data(path: Path) -> ExposureData:
     if not raw or exposure.seconds is not None or picture_kind(data) == "TIFF":
         return exposure
     libraw = optional_import("rawpy", str(path))
-    # LibRaw's errors: whoever develops the file says what is wrong with it.
+    # ``read_camera_raw`` reports LibRaw's errors.
     with contextlib.suppress(Exception), libraw.imread(io.BytesIO(data)) as opened:
-        other = opened.other  # which some versions of rawpy do not have
+        other = opened.other  # missing in some versions of rawpy
         return _plausible("", Lens(""), other.shutter, other.iso_speed, other.aperture)
     return exposure
 
 
 def exif_data(data: bytes) -> ExposureData:
-    """Exposure data in the EXIF tags of a picture file; damaged tags count as missing."""
+    """Return the exposure data in the EXIF tags of a picture file; damaged tags count as missing."""
     tags = tags_of(data)
     names = (str(tags.get(tag, "")).partition("\0")[0].strip() for tag in (_MAKER, _MODEL))
     camera = " ".join(filter(None, names))
@@ -331,12 +337,13 @@ def exif_data(data: bytes) -> ExposureData:
 
 
 def _lens(camera: str, tags: dict[int, Any]) -> Lens:
-    """Bodies and lenses count as one where their focal lengths are stated: then these tell cameras apart.
+    """Return the lens by EXIF tags.
 
-    Digital zoom makes another camera: whether a stated focal length has it is each maker's choice.
+    A stated focal length distinguishes lenses. Otherwise, serial number and name of the lens do. Pictures with digital
+    zoom have another camera, because only some makers include it in the focal length.
     """
     zoom = number_of(tags.get(_DIGITAL_ZOOM))
-    if zoom is not None and zoom > 0 and zoom != 1:  # 0: none was used
+    if zoom is not None and zoom > 0 and zoom != 1:  # 0 means no zoom
         camera = f"{camera} zoom {zoom:.3g}".lstrip()
     focal, of_film = (number_of(tags.get(tag)) for tag in (_FOCAL_LENGTH, _FOCAL_LENGTH_OF_FILM))
     stated = [(unit, value) for unit, value in (("film", of_film), ("lens", focal)) if value and value > 0]
@@ -346,35 +353,26 @@ def _lens(camera: str, tags: dict[int, Any]) -> Lens:
     return Lens(" ".join(filter(None, (camera, *more))))
 
 
-_FOCAL_AGREES = 0.01
-"""Relative difference of focal lengths that are one: tags are rounded, and lenses breathe with focus."""
-
-
 def camera_groups(paths: Mapping[str, Path]) -> dict[str, Lens]:
-    """The lens of each view, by its first file; focal lengths that agree become one. Empty where all have one lens.
+    """Return the lens of each view by its first file; agreeing focal lengths share a value. Empty for a single lens.
 
     Raises:
         PolarguideError: a file cannot be read.
     """
     lenses = {view: read_exposure_data(path).lens for view, path in paths.items()}
-    alike: list[Lens] = []
     groups: dict[str, Lens] = {}
+    last = None
     for view in sorted(lenses, key=lambda view: (lenses[view].camera, lenses[view].focal or 0.0, view)):
-        lens = lenses[view]
-        last = alike[-1] if alike else None
-        same = last is not None and lens.camera == last.camera
-        if same and last is not None and lens.focal and last.focal:
-            same = lens.focal < (1 + _FOCAL_AGREES) * last.focal
-        if not same:
-            alike.append(lens)
-        groups[view] = alike[-1]
-    return groups if len(alike) > 1 else {}
+        if last is None or not lenses[view].agrees(last):
+            last = lenses[view]
+        groups[view] = last
+    return groups if len(set(groups.values())) > 1 else {}
 
 
 def _plausible(
     camera: str, lens: Lens, seconds: float | None, iso: float | None, f_number: float | None
 ) -> ExposureData:
-    """Exposure data without numbers that no camera has, such as the 0 of a lens that states no aperture."""
+    """Return exposure data without implausible numbers, such as 0 for a missing aperture."""
     return ExposureData(
         camera,
         lens,
@@ -385,7 +383,7 @@ def _plausible(
 
 
 def number_of(value: Any) -> float | None:
-    """A tag as a number, the first of several; None where it is missing or not finite."""
+    """Return a tag as a number, the first of several; None if it is missing or not finite."""
     try:
         number = float(value[0] if isinstance(value, tuple) else value)
     except (TypeError, ValueError, IndexError, ZeroDivisionError):

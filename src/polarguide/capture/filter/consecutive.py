@@ -1,4 +1,4 @@
-"""Pictures that follow one another: shots of one place through a filter, and frames of a video."""
+"""Consecutive pictures: shots of one place through a filter, and frames of a video."""
 
 from __future__ import annotations
 
@@ -21,23 +21,22 @@ from polarguide.geometry.polarizer import ANGLES
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 MOST_SHOTS = 12
-"""Largest number of shots of one place, one every 15 degrees of half a turn."""
+"""Largest number of shots of one place, one every 15 degrees over 180 degrees."""
 _SAMPLED = 24
 _SIDE = 96
 _BLUR = 4.0
 _APART = 2.0
-"""Times by which pictures of two places differ more than those of one, at least."""
+"""Smallest ratio of the differences between groups and within groups."""
 
 
 def shots_of_one_place(paths: Sequence[Path]) -> int | None:
-    """How many consecutive pictures show one place, by what they show; None where they do not come in such groups.
+    """Return the number of consecutive pictures that show one place; None without such groups.
 
-    A filter that is turned changes reflections, but no edge moves. So pictures that follow one another are compared
-    without what is smooth in them, and groups are those inside which they differ much less than from group to group.
-    Only the first pictures are looked at.
+    A rotating filter changes reflections but moves no edge. Consecutive pictures are therefore compared without low
+    frequencies. Differences within groups must be much smaller than between groups. Only the first pictures are read.
 
     Raises:
-        PolarguideError: one cannot be read.
+        PolarguideError: a picture cannot be read.
     """
     count = len(paths)
     sizes = [size for size in range(2, MOST_SHOTS + 1) if count % size == 0 and count // size >= 3]
@@ -55,9 +54,9 @@ def shots_of_one_place(paths: Sequence[Path]) -> int | None:
 
 
 def numbered_like_angles(paths: Sequence[Path]) -> list[Path]:
-    """The first pictures that differ in one number of their names alone, which is 0, 45, 90 and 135; else none.
+    """Return the first pictures whose names differ only in a number, 0, 45, 90 and 135; empty without these.
 
-    As cup_P45.png, cup(45).png or 45_cup.png. Numbers that count pictures go on, or begin elsewhere.
+    Examples are cup_P45.png, cup(45).png and 45_cup.png. Numbers that count pictures have other values.
     """
     groups: dict[tuple[Path, str, str], dict[int, Path]] = {}
     for path in paths:
@@ -69,7 +68,7 @@ def numbered_like_angles(paths: Sequence[Path]) -> list[Path]:
 
 
 def _edges(path: Path) -> NDArray[np.float32]:
-    """A small gray picture without what is smooth, of deviation 1."""
+    """Return a small gray picture without low frequencies, with a standard deviation of 1."""
     raw = is_camera_raw(path)
     pixels = read_camera_raw(path, (1.0, 1.0, 1.0))[0] if raw else decode_picture(path, read_picture(path))
     small = cv2.resize(
@@ -80,22 +79,22 @@ def _edges(path: Path) -> NDArray[np.float32]:
 
 
 FRAMES_A_SECOND = 2.0
-"""Frames that are taken of a video; walking around a subject within a minute, the camera turns by 3 degrees."""
+"""Frames per second of a video. During a walk around a subject in a minute, the camera turns by 3 degrees per frame."""
 LEAST_FRAMES = 24
 MOST_FRAMES = 120
 _RECORD = "video.txt"
 
 
 def find_videos(root: Path) -> list[Path]:
-    """The videos in a folder, or the file itself if it is one."""
+    """Return the videos in a folder, or the file itself if it is one."""
     files = [root] if root.is_file() else sorted(root.iterdir()) if root.is_dir() else []
     return [path for path in files if path.is_file() and path.suffix.lower() in VIDEO_SUFFIXES]
 
 
 def extract_frames(video: Path, folder: Path, reporter: Reporter) -> int:
-    """Write frames of a video as PNG, upright: of equal spans of time the sharpest each; returns how many.
+    """Write the sharpest frame of each time interval of a video as PNG, upright; return the number of frames.
 
-    Frames that an earlier call has written of the same video are kept.
+    Frames of an earlier call with the same video are kept.
 
     Raises:
         PolarguideError: OpenCV cannot read the video, or it has too few frames.
@@ -108,7 +107,7 @@ def extract_frames(video: Path, folder: Path, reporter: Reporter) -> int:
     if folder.exists() and any(folder.iterdir()) and not done.is_file():
         raise PolarguideError(
             folder, expected="a new folder for the frames of the video", found="other files",
-            remedy="Choose another --out: the frames go into a folder beside it.",
+            remedy="Choose another --out: the folder of the frames is next to it.",
         )  # fmt: skip
     reader = cv2.VideoCapture(str(video))
     total = int(reader.get(cv2.CAP_PROP_FRAME_COUNT))
@@ -152,17 +151,17 @@ def _write(folder: Path, number: int, picture: NDArray[np.uint8]) -> None:
 
 
 _MANY = 100
-"""Pictures of which all pairs are compared, 4950, whatever their names."""
+"""Largest number of pictures of which all pairs are compared for any names, 4950 pairs."""
 _NUMBERED = re.compile(r"(?P<name>.*?)(?P<number>\d+)")
 _NEIGHBORS = 20
-"""Pictures that COLMAP compares each with; the next ten, and some at distances of powers of two."""
+"""Number of neighbors that COLMAP compares with each picture: the next ten, and some at powers of two."""
 
 
 def chosen_matching(views: Sequence[str], matching: str, reporter: Reporter) -> str:
-    """ "exhaustive" or "sequential", with a line for the user where ``auto`` decides for neighbors, or could save much.
+    """Return "exhaustive" or "sequential"; tell the user about the choice of ``auto``, or about a faster alternative.
 
     Args:
-        views: names in their order. matching: as asked for. reporter: for the line.
+        views: names in their order. matching: requested matching. reporter: for the message.
     """
     if matching != "auto":
         return matching
@@ -180,6 +179,6 @@ def chosen_matching(views: Sequence[str], matching: str, reporter: Reporter) -> 
         )
         return "sequential"
     if pairs > 2 * few or (running and pairs > few):
-        ordered = "If pictures that follow one another by name overlap, --matching sequential compares about"
-        reporter.say(f"Matching: all {pairs} pairs. {ordered} {few}.")
+        option = "If consecutive pictures by name overlap, --matching sequential compares about"
+        reporter.say(f"Matching: all {pairs} pairs. {option} {few}.")
     return "exhaustive"

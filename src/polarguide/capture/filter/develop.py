@@ -1,4 +1,4 @@
-"""From stored shots to aligned linear intensities: small shifts between the shots, and their transfer function."""
+"""Alignment of the shots of a view: estimation and correction of small shifts and rotations."""
 
 from __future__ import annotations
 
@@ -13,10 +13,9 @@ from numpy.typing import NDArray
 from polarguide.geometry.polarizer import ANGLES
 
 SMALLEST = 0.2
-"""Shifts below this many pixels are not corrected: resampling would blur more, and polarization causes errors of the
-estimate of this size."""
+"""Smallest shift in pixels that is corrected. Errors of the estimate have this size, and resampling blurs."""
 LARGEST_SHARE = 0.05
-"""Shifts above this share of the picture's width are reported but not corrected."""
+"""Largest shift that is corrected, as a share of the picture's width."""
 
 _BETTER = 0.95
 _CRITERIA = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 100, 1e-5)
@@ -24,13 +23,13 @@ _CRITERIA = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 100, 1e-5)
 
 @dataclass(frozen=True)
 class Shift:
-    """How a shot lies relative to the first.
+    """Displacement of a shot relative to the first.
 
     Attributes:
         x, y: shift in pixels, right and down; with a ``warp``, that of the picture's center.
-        trusted: whether the estimate is reliable.
-        warp: affine matrix [2, 3], row by row, that maps pixels of the first shot to this one; None: the camera did not
-            turn between them. In it, unlike elsewhere, the center of the first pixel is (0, 0).
+        trusted: True for a reliable estimate.
+        warp: affine matrix [2, 3], row by row, from pixels of the first shot to this one; None without rotation. Unlike
+            elsewhere, the center of the first pixel is (0, 0).
     """
 
     x: float
@@ -40,25 +39,25 @@ class Shift:
 
     @property
     def corrected(self) -> bool:
-        """Whether the shift is corrected: reliable and large enough."""
+        """True if the shift is reliable and large enough for a correction."""
         return self.trusted and (self.warp is not None or max(abs(self.x), abs(self.y)) >= SMALLEST)
 
 
 AGREEING = 0.05
-"""Mean |I0 + I90 - I45 - I135| / S0 up to which shots lie on one another; ``inspect`` calls more inconsistent."""
+"""Largest mean |I0 + I90 - I45 - I135| / S0 of aligned shots; ``inspect`` calls larger values inconsistent."""
 
 
 def estimate_shifts(linear: NDArray[np.float32]) -> list[Shift]:
     """Estimate the shifts of the four shots relative to the first.
 
-    Phase correlation of the logarithms' fine detail finds a start (brightness and polarization change slowly
-    across a surface, edges stay); maximizing the enhanced correlation coefficient refines it to a fraction of
-    a pixel. Edges of polarization can mislead both, so the shifts are trusted only if with them
-    I0 + I90 = I45 + I135 holds better than without. If the camera was turned, pair sums agree still better with a
-    rotation beside the shift. A homography agrees with them better still, but less with the truth.
+    Phase correlation of fine detail in the logarithms gives initial values: brightness and polarization vary slowly
+    across a surface, and edges stay. Maximization of the enhanced correlation coefficient refines them to a fraction of
+    a pixel. Edges of polarization can mislead both. Shifts are therefore trusted only if they improve I0 + I90 = I45 +
+    I135. A rotation is added if it improves the pair sums further. A homography would improve them more, but deviates
+    more from the truth.
 
     Args:
-        linear: [4, H, W, 3] linear intensities.
+        linear: linear intensities [4, H, W, 3].
     """
     detail = [_detail(shot) for shot in linear]
     shifts = [Shift(0.0, 0.0, True), *(_shift(detail[0], other) for other in detail[1:])]
@@ -72,7 +71,7 @@ def estimate_shifts(linear: NDArray[np.float32]) -> list[Shift]:
     turned = [shifts[0], *(_turn(detail[0], detail[k], shifts[k]) for k in (1, 2, 3))]
     if turned != shifts and _aligned_disagreement(linear, turned) < _BETTER * least:
         return turned
-    if least < AGREEING:  # nothing moved, whatever the details say
+    if least < AGREEING:  # pair sums agree, so shots did not move
         return [shift if shift.trusted else Shift(0.0, 0.0, True) for shift in shifts]
     return shifts
 
@@ -83,7 +82,7 @@ def _aligned_disagreement(linear: NDArray[np.float32], shifts: Sequence[Shift]) 
 
 
 def _disagreement(linear: NDArray[np.float32], bad: NDArray[np.bool_]) -> float:
-    """Mean |I0 + I90 - I45 - I135| relative to S0, after removing a common gain."""
+    """Return the mean |I0 + I90 - I45 - I135| relative to S0, after removal of a common gain."""
     i0, i45, i90, i135 = linear.mean(axis=3)[:, ~bad]
     first = i0 + i90
     second = i45 + i135
@@ -95,16 +94,16 @@ def _disagreement(linear: NDArray[np.float32], bad: NDArray[np.bool_]) -> float:
 def align_shots(
     linear: NDArray[np.float32], masks: Sequence[NDArray[np.bool_]], shifts: Sequence[Shift]
 ) -> tuple[NDArray[np.float32], list[NDArray[np.bool_]], NDArray[np.bool_]]:
-    """Shift the shots back.
+    """Align shots by their shifts.
 
     Args:
-        linear: [K, H, W, 3] linear intensities.
-        masks: pixels of each shot, [K, H, W], or of all shots, [H, W].
+        linear: linear intensities [K, H, W, 3].
+        masks: masks of each shot, [K, H, W], or of all shots, [H, W].
         shifts: shifts of the shots.
 
     Returns:
-        The moved intensities; for each mask the pixels that depend on a marked one of any shot, [H, W]; and the pixels
-        that depend on one outside of a shot, [H, W].
+        The aligned intensities; for each mask the pixels that depend on a marked pixel of any shot, [H, W]; and the
+        pixels that depend on a place outside of a shot, [H, W].
     """
     height, width = linear.shape[1:3]
     moved = linear.copy()
@@ -130,7 +129,7 @@ def align_shots(
 
 
 def remapped_mask(mask: NDArray[np.bool_], x: Any, y: Any) -> NDArray[np.bool_]:
-    """A mask [H, W] looked up at places ``x`` and ``y``: True where a pixel of it or one outside has weight."""
+    """Resample a mask [H, W] at places ``x`` and ``y``: True if a marked pixel or a place outside has weight."""
     weight = cv2.remap(
         mask.astype(np.float32), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=1.0
     )
@@ -138,7 +137,7 @@ def remapped_mask(mask: NDArray[np.bool_], x: Any, y: Any) -> NDArray[np.bool_]:
 
 
 def moved_shots(shifts: Sequence[Shift]) -> list[str]:
-    """The shots that were shifted back, and by how much, in words."""
+    """Return the shots that were shifted back, with their shifts, as text."""
     return [
         f"{angle} by ({-shift.x:+.2f}, {-shift.y:+.2f}){'' if shift.warp is None else ' and turned'}"
         for angle, shift in zip(ANGLES, shifts, strict=True)
@@ -147,14 +146,14 @@ def moved_shots(shifts: Sequence[Shift]) -> list[str]:
 
 
 def shift_notes(view: str, shifts: Sequence[Shift]) -> list[str]:
-    """Notes about shots that were moved back, and about shots that seem to have moved without a reliable estimate."""
+    """Return notes about corrected shots, and about shots with an unreliable shift."""
     moved = moved_shots(shifts)
     doubtful = [str(angle) for angle, shift in zip(ANGLES, shifts, strict=True) if not shift.trusted]
-    notes = [f"{view}: shots moved, in pixels: {', '.join(moved)}."] if moved else []
+    notes = [f"{view}: shots were shifted back, in pixels: {', '.join(moved)}."] if moved else []
     if doubtful:
         notes.append(
-            f"{view}: I0 + I90 and I45 + I135 differ, and no shift of the shots at {', '.join(doubtful)} explains it; "
-            "they are used as they are."
+            f"{view}: I0 + I90 and I45 + I135 differ, and no shift of the shots at {', '.join(doubtful)} explains it. "
+            "These shots are not shifted."
         )
     return notes
 
@@ -166,11 +165,11 @@ def _detail(shot: NDArray[np.float32]) -> NDArray[np.float32]:
 
 def _shift(reference: NDArray[np.float32], other: NDArray[np.float32]) -> Shift:
     height, width = reference.shape
-    if min(height, width) < 2:  # a window that fades out on both sides has no middle there
+    if min(height, width) < 2:  # the window needs two pixels
         return Shift(0.0, 0.0, False)
     window = cv2.createHanningWindow((width, height), cv2.CV_32F)
-    # Borders count less: what enters the picture there has no match. Done here, as phaseCorrelate does it in place, and
-    # only to pictures of some sizes.
+    # The window reduces the weight of borders, where new content has no match. phaseCorrelate would apply it in place,
+    # and only for some sizes.
     reference = reference * window
     other = other * window
     (x, y), _ = cv2.phaseCorrelate(reference, other)
@@ -182,7 +181,7 @@ def _shift(reference: NDArray[np.float32], other: NDArray[np.float32]) -> Shift:
         score, moved = cv2.findTransformECC(
             reference, other, warp, cv2.MOTION_TRANSLATION, _CRITERIA, np.ones(reference.shape, np.uint8), 5
         )
-    except cv2.error:  # it does not converge where there is no detail to compare
+    except cv2.error:  # no convergence without detail
         return Shift(0.0, 0.0, False)
     x, y = (float(value) for value in np.asarray(moved)[:, 2])
     return Shift(
@@ -193,12 +192,13 @@ def _shift(reference: NDArray[np.float32], other: NDArray[np.float32]) -> Shift:
 
 
 _TURN_SIDE = 1024
-"""Pixels of the longer side at which turns are estimated, to a fraction of a pixel."""
+"""Longer side in pixels at which rotations are estimated."""
 
 
 def _turn(reference: NDArray[np.float32], other: NDArray[np.float32], shift: Shift) -> Shift:
-    """The shift and rotation of a shot whose camera was turned, beginning with its shift; the shift itself where none
-    converges, or where no corner moves otherwise.
+    """Return shift and rotation of a shot, starting from its shift.
+
+    The shift is returned unchanged if the estimate does not converge, or if the rotation moves no corner.
     """
     height, width = reference.shape
     if min(height, width) < 2:
@@ -208,7 +208,9 @@ def _turn(reference: NDArray[np.float32], other: NDArray[np.float32], shift: Shi
         cv2.resize(d, (width // factor, height // factor), interpolation=cv2.INTER_AREA)
         for d in (reference, other)
     ]
-    half = (factor - 1) / 2  # of the middle of a small picture's first pixel from that of the large one's
+    half = (
+        factor - 1
+    ) / 2  # distance between the centers of the first pixels of the small and the large picture
     large = np.array([[factor, 0, half], [0, factor, half], [0, 0, 1]], np.float64)
     start = np.eye(3)
     start[:2, 2] = (shift.x, shift.y) if shift.trusted else (0.0, 0.0)
@@ -218,7 +220,7 @@ def _turn(reference: NDArray[np.float32], other: NDArray[np.float32], shift: Shi
         score, start[:2] = cv2.findTransformECC(
             small[0], small[1], start[:2].copy(), cv2.MOTION_EUCLIDEAN, _CRITERIA, everywhere, 5
         )
-    except cv2.error:  # it does not converge where there is no detail to compare
+    except cv2.error:  # no convergence without detail
         return shift
     warp = large @ start.astype(np.float64) @ np.linalg.inv(large)
     corners = np.array([[x, y] for x in (0, width - 1) for y in (0, height - 1)], np.float64)

@@ -1,4 +1,4 @@
-"""How the pictures of a capture are encoded: as the light tells, as their files state, or as their kind usually is."""
+"""Encoding of the pictures of a capture: measured by the light, stated by the files, or usual for their format."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ _CHARACTERISTICS = {
     5: 2.8,
     8: 1.0,
 }
-"""Exponents of transfer characteristics (ITU-T H.273). Those of television are shown as sRGB is."""
+"""Exponents of transfer characteristics (ITU-T H.273). Television's are displayed like sRGB."""
 _UNSPECIFIED = 2
 _TIFF_PROFILE = 34675
 _TRANSFER_FUNCTION = 301
@@ -53,29 +53,28 @@ _MIDDLE = 0.5
 
 @dataclass(frozen=True)
 class Encoding:
-    """How a picture file says that it is encoded.
+    """Encoding that a picture file states.
 
     Attributes:
-        exponent: light = value ^ exponent at half scale: 1 is linear, 2.2 sRGB and Adobe RGB, 1.8 ProPhoto RGB; None
-            where it is no such curve.
-        words: what says so.
+        exponent: exponent at half scale, light = value ^ exponent: 1 for linear files, 2.2 for sRGB and Adobe RGB, 1.8
+            for ProPhoto RGB; None for other curves.
+        source: field of the file with this statement.
     """
 
     exponent: float | None
-    words: str
+    source: str
 
 
 def stated_encoding(data: bytes) -> Encoding | None:
-    """The encoding that a picture file states; None where it states none that can be read.
+    """Return the encoding that a picture file states; None without a readable statement.
 
-    By transfer characteristics (cICP of PNG, nclx of HEIC), else an ICC profile, else sRGB and gAMA of PNG or
-    TransferFunction of TIFF, else gamma and color space of EXIF: a more specific statement goes first, as in the
-    standard of PNG.
+    The order of precedence follows the standard of PNG, with specific statements first: transfer characteristics (cICP
+    of PNG, nclx of HEIC), ICC profile, sRGB and gAMA of PNG or TransferFunction of TIFF, gamma and color space of EXIF.
     """
     characteristics = None
     profile = None
     rest = None
-    # A statement that cannot be read states nothing: Pillow, tifffile and pillow-heif raise what they please.
+    # Damaged statements count as missing. Pillow, tifffile and pillow-heif raise many classes of errors.
     with contextlib.suppress(Exception), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         kind = picture_kind(data)
@@ -111,13 +110,13 @@ def stated_encoding(data: bytes) -> Encoding | None:
 
 
 def _of_tiff(data: bytes) -> tuple[bytes | None, Encoding | None]:
-    """The ICC profile of a TIFF file, and what its transfer function says."""
+    """Return the ICC profile of a TIFF file, and the encoding by its transfer function."""
     with tifffile.TiffFile(io.BytesIO(data)) as file:
         tags = file.pages.first.tags
         profile = tags.valueof(_TIFF_PROFILE)
         function = tags.valueof(_TRANSFER_FUNCTION)
         count = 1 << int(file.pages.first.bitspersample)
-    curve = np.ravel([] if function is None else function)  # of all colors, or of one after the other
+    curve = np.ravel([] if function is None else function)  # one curve for all colors, or one after the other
     place = round(_MIDDLE * (count - 1))
     middle = float(curve[place]) / 65535 if len(curve) >= count else 0.0
     exponent = math.log(middle) / math.log(place / (count - 1)) if 0 < middle < 1 else None
@@ -125,7 +124,7 @@ def _of_tiff(data: bytes) -> tuple[bytes | None, Encoding | None]:
 
 
 def profile_exponent(profile: bytes) -> float | None:
-    """The exponent of an ICC profile as in ``Encoding``; None where it has no such curve, or is damaged."""
+    """Return the exponent of an ICC profile as in ``Encoding``; None for other curves and damaged profiles."""
     try:
         decoded = _decoded_middle(profile)
     except (struct.error, OverflowError, ValueError, IndexError):
@@ -136,7 +135,7 @@ def profile_exponent(profile: bytes) -> float | None:
 
 
 def _decoded_middle(profile: bytes) -> float | None:
-    """Value of a profile's red or gray curve at half scale (ICC.1, curveType and parametricCurveType)."""
+    """Return the value of a profile's red or gray curve at half scale (ICC.1, curveType, parametricCurveType)."""
     (count,) = struct.unpack_from(">I", profile, 128)
     entries = [struct.unpack_from(">4sII", profile, 132 + 12 * number) for number in range(min(count, 100))]
     at = next((at for name, at, _ in entries if name in _CURVES), None)
@@ -157,7 +156,7 @@ def _decoded_middle(profile: bytes) -> float | None:
         return None
     numbers = [n / 65536 for n in struct.unpack_from(f">{_PARAMETERS[form]}i", profile, at + 12)]
     factor, shift = numbers[1:3] if form else (1.0, 0.0)
-    # Half scale lies above the linear part of every curve in use.
+    # Half scale is above the linear part of all common curves.
     raised = numbers[{2: 3, 4: 5}[form]] if form in (2, 4) else 0.0
     return float(max(0.0, factor * _MIDDLE + shift) ** max(numbers[0], 0.1) + raised)
 
@@ -166,73 +165,74 @@ LOSSY = "JPEG, WebP or HEIC"
 PLAIN = "PNG, TIFF or BMP"
 CAMERA_RAW = "camera raw"
 VIDEO = "video"
-"""Frames of a video: sRGB unless the file states another encoding."""
+"""Kind of frames of a video: sRGB unless the file states another encoding."""
 ARRAY = "array"
-"""Arrays: linear."""
+"""Kind of arrays: linear."""
 
 
 def kind_of_file(path: Path) -> str:
-    """The kind of a photograph by its suffix."""
+    """Return the kind of a photograph by its suffix."""
     return CAMERA_RAW if is_camera_raw(path) else LOSSY if is_lossy(path) else PLAIN
 
 
 Stated = tuple[str, str]
-"""An encoding, linear or srgb, and what states it."""
+"""An encoding, linear or srgb, and the field that states it."""
 _NEAR = 0.1
-"""Share by which an exponent may differ from that of linear files or sRGB. DoLP is off by as much as the exponent."""
+"""Largest relative deviation of an exponent from those of linear files and sRGB. It is also the relative error of
+DoLP."""
 
 
-def transfer_of(path: Path, exponent: float | None, words: str) -> Stated:
-    """The transfer of an exponent that a file states.
+def transfer_of(path: Path, encoding: Encoding) -> Stated:
+    """Return the transfer function of an encoding that a file states.
 
     Raises:
-        PolarguideError: it is neither linear nor like sRGB.
+        PolarguideError: the encoding is not linear or similar to sRGB.
     """
-    known = {"linear": 1.0, "srgb": SRGB_EXPONENT}
-    for transfer, its in known.items():
-        if exponent is not None and abs(exponent / its - 1) <= _NEAR:
-            return transfer, words
+    exponent = encoding.exponent
+    for transfer, usual in (("linear", 1.0), ("srgb", SRGB_EXPONENT)):
+        if exponent is not None and abs(exponent / usual - 1) <= _NEAR:
+            return transfer, encoding.source
     raise PolarguideError(
         path,
         expected="a linear picture, or one encoded as sRGB (gamma 2.2)",
-        found=f"another encoding by {words}" + ("" if exponent is None else f", gamma {exponent:.2f}"),
-        remedy="Export with a linear profile or sRGB, film in standard range: DoLP would be wrong. If the statement is "
-        "wrong, give --transfer linear or srgb.",
+        found=f"another encoding by {encoding.source}"
+        + ("" if exponent is None else f", gamma {exponent:.2f}"),
+        remedy="Export with a linear profile or sRGB, and film in standard range, for a right DoLP. If the statement "
+        "is wrong, use --transfer linear or srgb.",
     )
 
 
 def stated_transfer(paths: Sequence[Path]) -> Stated | None:
-    """The encoding that pictures of one kind state; None where none states any.
+    """Return the encoding that pictures of one kind state; None if no picture states one.
 
     Raises:
-        PolarguideError: one states another encoding than linear or sRGB, or two of them differ.
+        PolarguideError: a picture states another encoding than linear or sRGB, or pictures differ.
     """
     first: dict[str, tuple[Path, str]] = {}
-    silent: Path | None = None
+    without: Path | None = None
     for path in paths:
         encoding = None if is_camera_raw(path) else stated_encoding(read_picture(path))
         if encoding is not None:
-            transfer, words = transfer_of(path, encoding.exponent, encoding.words)
-            first.setdefault(transfer, (path, words))
+            transfer, source = transfer_of(path, encoding)
+            first.setdefault(transfer, (path, source))
         elif is_lossy(path):
-            first.setdefault("srgb", (path, ""))  # by custom
+            first.setdefault("srgb", (path, ""))  # by convention
         else:
-            silent = silent or path
-    found = [(path, f"{transfer} by {words or 'custom'}") for transfer, (path, words) in first.items()]
-    if found and silent is not None:
-        found.append((silent, "a file that states none"))
-    if len(found) > 1:
+            without = without or path
+    kinds = [(path, f"{transfer} by {source or 'convention'}") for transfer, (path, source) in first.items()]
+    if kinds and without is not None:
+        kinds.append((without, "a file without a stated encoding"))
+    if len(kinds) > 1:
         raise PolarguideError(
-            found[1][0],
-            expected=f"the encoding of {found[0][0].name}, {found[0][1]}",
-            found=found[1][1],
-            remedy="Export all pictures with the same settings, or give --transfer.",
+            kinds[1][0],
+            expected=f"the encoding of {kinds[0][0].name}, {kinds[0][1]}",
+            found=kinds[1][1],
+            remedy="Export all pictures with the same settings, or specify --transfer.",
         )
-    transfer, (_, words) = next(iter(first.items()), ("", (None, "")))
-    return (transfer, words) if words else None
+    return next(((transfer, source) for transfer, (_, source) in first.items() if source), None)
 
 
-_OF_VIDEO = {
+_VIDEO_EXPONENTS = {
     **dict.fromkeys(("unknown", "reserved"), None),
     "linear": 1.0,
     **dict.fromkeys(
@@ -251,46 +251,43 @@ _OF_VIDEO = {
     "bt470m": 2.2,
     "bt470bg": 2.8,
 }
-"""Exponents of transfers by ffmpeg's names; those of television are shown as sRGB is."""
+"""Exponents of transfers by ffmpeg's names. Television's are displayed like sRGB."""
 _HIGH_RANGE = {"smpte2084": "PQ", "arib-std-b67": "HLG"}
 _COLORS = re.compile(r"[\w-]+/[\w-]+/([\w-]+)")
-"""Matrix, primaries and transfer as ffmpeg describes them, as in yuv420p(tv, bt2020nc/bt2020/arib-std-b67)."""
+"""Matrix, primaries and transfer in ffmpeg's description, such as yuv420p(tv, bt2020nc/bt2020/arib-std-b67)."""
 
 
 def stated_video_transfer(path: Path) -> Stated | None:
-    """The encoding that a video states, as ffmpeg names it; None where it states none.
+    """Return the encoding that a video states, by ffmpeg's name; None without a statement.
 
     Raises:
-        PolarguideError: it is neither linear nor like sRGB.
+        PolarguideError: the encoding is not linear or similar to sRGB.
     """
     decoder = optional_import("imageio_ffmpeg", str(path))
-    logging.getLogger("imageio_ffmpeg").setLevel(logging.ERROR)  # of turned films it says that sizes differ
-    # Logarithmic films are not converted: the frames are taken for others, and the description is that of the file.
+    logging.getLogger("imageio_ffmpeg").setLevel(logging.ERROR)  # it warns about sizes of rotated films
+    # Logarithmic films cannot be converted. The option relabels the frames, but not the description of the file.
     frames = decoder.read_frames(str(path), output_params=["-vf", "setparams=color_trc=bt709"])
     try:
         described = str(next(frames).get("pix_fmt", ""))
-    except (OSError, RuntimeError, StopIteration):  # whoever reads the frames says what is wrong
+    except (OSError, RuntimeError, StopIteration):  # the reader of the frames reports it
         return None
     finally:
         frames.close()
     colors = _COLORS.search(described)
-    # One name stands for all three where they agree, as in yuv420p(tv, bt709).
-    words = (
-        [colors[1]] if colors else [word for word in re.findall(r"[\w-]+", described) if word in _OF_VIDEO]
-    )
-    name = words[0] if words else "unknown"
-    if name in _OF_VIDEO and _OF_VIDEO[name] is None:
+    # Three equal names are described by one, as in yuv420p(tv, bt709).
+    names = (name for name in re.findall(r"[\w-]+", described) if name in _VIDEO_EXPONENTS)
+    name = colors[1] if colors else next(names, "unknown")
+    if name in _VIDEO_EXPONENTS and _VIDEO_EXPONENTS[name] is None:
         return None
-    return transfer_of(
-        path,
-        _OF_VIDEO.get(name),
-        f"transfer {name}" + (f" ({_HIGH_RANGE[name]}, high dynamic range)" if name in _HIGH_RANGE else ""),
+    label = f"transfer {name}" + (
+        f" ({_HIGH_RANGE[name]}, high dynamic range)" if name in _HIGH_RANGE else ""
     )
+    return transfer_of(path, Encoding(_VIDEO_EXPONENTS.get(name), label))
 
 
 @dataclass(frozen=True)
 class TransferDecision:
-    """The chosen transfer function, a sentence that says why, and what to warn of: "" or a sentence."""
+    """Decision on a transfer function, with a note on its reason and a warning, or ""."""
 
     transfer: str
     note: str
@@ -298,17 +295,17 @@ class TransferDecision:
 
 
 Slope = Callable[[str], checks.Curvature | None]
-"""The curvature of the response that a transfer leaves; None where the light does not tell."""
+"""Function from a transfer function to the curvature of the response; None if the light does not determine it."""
 
 
 def decide_transfer(
     kind: str, stated: Stated | None, *, eight: bool, slope: Slope | None
 ) -> TransferDecision:
-    """How pictures are encoded: as the light tells, else as they state, else as their kind usually is.
+    """Decide the encoding of pictures: by the light, else by their statement, else by their kind.
 
     Args:
-        kind: their kind. stated: what they state. eight: whether they have 8 bits a channel.
-        slope: of views at several angles; None where every view is one picture.
+        kind: kind of the pictures. stated: stated encoding. eight: True for 8 bits per channel.
+        slope: curvature of views at several angles; None if every view is one picture.
     """
     measured = None if slope is None else slope("linear")
     encoding = checks.encoding(measured)
@@ -317,42 +314,46 @@ def decide_transfer(
         doubt = _doubt(slope, encoding)
         if stated is not None and stated[0] != encoding:
             doubt = (
-                f"The files state {stated[0]} ({stated[1]}), and their pair sums say {encoding}, which is believed "
-                f"(--transfer {stated[0]} overrides)."
+                f"The files state {stated[0]} ({stated[1]}), but their pair sums are {encoding}, which is used "
+                f"(--transfer {stated[0]} overrides this)."
             )
         return TransferDecision(encoding, f"Transfer {encoding}: {note}.", doubt)
     if stated is not None:
         note = f"Transfer {stated[0]}, as the files state ({stated[1]})."
         return TransferDecision(stated[0], note, _doubt(slope, stated[0]))
-    untold = ""
+    undecided = ""
     if slope is not None:
-        untold = ": no two pairs at right angles, or too few pixels are polarized for their sums to tell"
+        undecided = (
+            ": there are no two pairs at right angles, or too few polarized pixels to decide by their sums"
+        )
     if measured is not None:
-        untold = (
+        undecided = (
             f": the curvature of the response is {measured.value:+.2f} +- {measured.error:.2f}; linear files have 0, "
             "sRGB about -0.6"
         )
     if kind == PLAIN and eight and slope is not None:
         doubt = (
-            "The 8-bit files state no encoding, and their pair sums do not tell it: they are taken as linear. If they "
-            "are sRGB, as photographs usually are, DoLP is wrong; --transfer linear or srgb says it."
+            "The 8-bit files state no encoding, and their pair sums do not decide it. They are read as linear. If they "
+            "are sRGB, like most photographs, DoLP is wrong. Specify --transfer linear or srgb."
         )
-        return TransferDecision("linear", f"Transfer linear{untold} (--transfer sets it).", doubt)
+        return TransferDecision("linear", f"Transfer linear{undecided} (--transfer sets it).", doubt)
     usual = "srgb" if kind in (LOSSY, VIDEO) or (kind == PLAIN and eight) else "linear"
     bits = f"{8 if eight else 16}-bit " if kind == PLAIN else ""
     if kind == ARRAY:
-        return TransferDecision(usual, f"Transfer {usual}, as arrays are.", _doubt(slope, usual))
-    note = f"Transfer {usual}, as {bits}{kind} files usually are{untold} (--transfer sets it)."
+        return TransferDecision(usual, f"Transfer {usual}, the convention of arrays.", _doubt(slope, usual))
+    note = f"Transfer {usual}, as {bits}{kind} files usually are{undecided} (--transfer sets it)."
     return TransferDecision(usual, note, _doubt(slope, usual))
 
 
 def slope_of_shots(shots: Sequence[Shots], angles: Sequence[Sequence[Angle]]) -> Slope:
-    """The curvature of the response over some views, whatever the exposures of their pictures.
+    """Return the curvature of the response over some views as a function of the transfer function.
+
+    Exposures of the pictures may differ.
 
     Args:
-        shots: of each view, aligned well enough (as from a tripod). angles: of each view's pictures.
+        shots: shots of each view without large shifts, as from a tripod. angles: angles of each view's pictures.
     """
-    pairs = [checks.right_pairs(mine) for mine in angles]
+    pairs = [checks.right_pairs(view) for view in angles]
     samples = [checks.sampled(view.pictures) for view in shots]
     usable = [checks.sampled(~(view.clipped.any(axis=0) | view.dark)[None])[0] for view in shots]
 
@@ -371,22 +372,23 @@ def transfer_of_pictures(
     *,
     video: Path | None = None,
 ) -> TransferDecision:
-    """The transfer of the pictures of a capture or of one set.
+    """Decide the transfer function of the pictures of a capture or of one set.
 
     Args:
-        paths: their files; none of pictures in memory. transfer: as given, or auto.
-        judged: reads the shots of some views and the angles of each; all views have several pictures, or it is one.
-        video: the file, if they are its frames.
+        paths: their files; empty for pictures in memory. transfer: specified transfer function, or auto.
+        judged: function that reads the shots of some views and the angles of each; either all views have several
+            pictures, or one has.
+        video: the file of a video, if the pictures are its frames.
 
     Raises:
-        PolarguideError: the files state an encoding that is not read, or several.
+        PolarguideError: the files state an unsupported encoding, or several.
     """
     kind = VIDEO if video else kind_of_file(paths[0]) if paths else ARRAY
     if kind == CAMERA_RAW:
-        note = "Transfer linear: camera raw, developed without tone curve, alike for all shots."
+        note = "Transfer linear: camera raw, developed without a tone curve and equally for all shots."
         return TransferDecision("linear", note)
     if transfer != "auto":
-        return TransferDecision(transfer, f"Transfer {transfer}, as given.")
+        return TransferDecision(transfer, f"Transfer {transfer}, as specified.")
     stated = stated_video_transfer(video) if video else stated_transfer(paths) if paths else None
     shots, angles = zip(*judged(), strict=True)
     return decide_transfer(
@@ -398,11 +400,11 @@ def transfer_of_pictures(
 
 
 def _doubt(slope: Slope | None, transfer: str) -> str:
-    """The warning where the chosen transfer surely leaves the response curved, as a camera's own tone curve does."""
-    left = None if slope is None else slope(transfer)
-    if left is None or not (left.surely_below(-checks.BENT) or left.surely_above(checks.BENT)):
+    """Return a warning if the transfer function leaves a significant curvature, like a tone curve; else ""."""
+    curvature = None if slope is None else slope(transfer)
+    if curvature is None or not (curvature.surely_below(-checks.BENT) or curvature.surely_above(checks.BENT)):
         return ""
     return (
-        f"Read as {transfer}, the response still has a curvature of {left.value:+.2f} (0 if it is linear): the files "
-        "have another tone curve, and DoLP is wrong. Export 16-bit TIFF without a tone curve, or take camera raw."
+        f"Read as {transfer}, the response still has a curvature of {curvature.value:+.2f} (0 if it is linear). The "
+        "files have another tone curve, and DoLP is wrong. Export 16-bit TIFF without a tone curve, or use camera raw."
     )

@@ -1,4 +1,4 @@
-"""Find and read photographs through a filter: four shots of a view, or single ones at any angles."""
+"""Discovery and reading of photographs through a filter: four shots of a view, or single shots at any angles."""
 
 from __future__ import annotations
 
@@ -43,26 +43,26 @@ from polarguide.core.text import canonical, listed, stem_of
 
 SHOT_SUFFIXES = (*SUFFIXES, *CAMERA_RAW)
 Candidates = dict[str, dict[int, list[Path]]]
-"""View -> angle -> the files that may be its shot: one, unless names are ambiguous."""
+"""Possible files of each shot by view and angle. Ambiguous names give several files."""
 _SUFFIX = re.compile(
     r"(?P<view>.+?)[-_ .]+(?:i|pol|angle)?[-_ ]?(?<![_ .]-)(?P<angle>0{1,3}|0?45|0?90|135)(?:deg)?",
     re.IGNORECASE,
 )
 _BARE = re.compile(r"(?:(?:i|pol|angle)[-_ ]?|[_ ])?(?P<angle>0{1,3}|0?45|0?90|135)(?:deg)?", re.IGNORECASE)
-# Compression smears the edge of clipped areas over a few values of 8 bits.
+# Compression spreads the values at the edge of clipped areas over a few 8-bit values.
 _LOSSY_FULL = 250 / 255
-# Bytes that a pixel of four shots takes at least: as decoded, and stacked.
+# Smallest memory in bytes per pixel of four shots, decoded and stacked.
 _READ = 4 * 3 * (2 + 2)
 
 
 @dataclass(frozen=True, eq=False)
 class Shots:
-    """The shots of a view as stored: four, or K at other angles.
+    """Stored shots of a view: four, or K at other angles.
 
     Attributes:
-        pictures: [4, H, W, 3] uint8 or uint16, by the names of the angles; or [K, H, W, 3].
-        orientation: their EXIF orientation.
-        clipped: pixels with a channel of a shot at full scale, [4, H, W] or [K, H, W].
+        pictures: stored values [K, H, W, 3], uint8 or uint16, in the order of the angles.
+        orientation: EXIF orientation.
+        clipped: pixels with a channel of a shot at full scale, [K, H, W].
         dark: pixels that are 0 in all shots and channels, [H, W].
     """
 
@@ -73,18 +73,18 @@ class Shots:
 
 
 def find_shots(root: Path, *, nested: bool = False) -> dict[str, dict[int, Path]]:
-    """View -> angle -> file: from four folders named like the angles, or from four suffixes.
+    """Return the file of each view and angle: by four folders named like the angles, or by four suffixes.
 
-    Folders are ``0``, ``45``, ``90``, ``135``, also ``000``, ``I-00``, ``pol_45``, ...; suffixes are the same
-    after ``_``, ``-``, a point or a blank: ``cup_0.jpg``, ``cup-I45.jpg``. Files named like the angles alone
-    (``I0.png``, ``I45.png``, ...) are one view, called like the folder, where there is nothing else.
+    Folders are ``0``, ``45``, ``90``, ``135``, also ``000``, ``I-00``, ``pol_45``, ... Suffixes are the same after
+    ``_``, ``-``, a point or a blank: ``cup_0.jpg``, ``cup-I45.jpg``. Files named like the angles alone (``I0.png``,
+    ``I45.png``, ...) are one view, named like the folder, if the folder has no other files.
 
     Args:
         root: the folder.
-        nested: read the folders in one that has no pictures itself, such as one for each view or day.
+        nested: read the subfolders of a folder without pictures, such as one for each view or day.
 
     Returns:
-        Nothing where neither is found. Angles may be missing; ``require_four_shots`` checks.
+        An empty dictionary without such names. Angles may be missing; ``require_four_shots`` checks.
 
     Raises:
         PolarguideError: two files have the same view and angle, or a folder is missing.
@@ -98,7 +98,7 @@ def find_shots(root: Path, *, nested: bool = False) -> dict[str, dict[int, Path]
 
 
 def list_shots(root: Path, *, nested: bool = False) -> tuple[Candidates, list[Path]]:
-    """The shots of ``find_shots``, with every file of a view and angle where there are several, and the other pictures.
+    """Return the shots of ``find_shots`` with all files of each view and angle, and the other pictures.
 
     Raises:
         PolarguideError: a folder of an angle is missing, or there are two.
@@ -116,15 +116,15 @@ def list_shots(root: Path, *, nested: bool = False) -> tuple[Candidates, list[Pa
         for path in list_files(folder, SHOT_SUFFIXES):
             shots.setdefault(stem_of(path), {}).setdefault(angle, []).append(path)
     if not shots:
-        _refuse_strangers(folders.values())
+        _refuse_other_formats(folders.values())
     return shots, []
 
 
-def _refuse_strangers(folders: Iterable[Path]) -> None:
-    """Refuse folders of angles whose files are all of kinds that are not read.
+def _refuse_other_formats(folders: Iterable[Path]) -> None:
+    """Refuse folders of angles that contain only files of other formats.
 
     Raises:
-        PolarguideError: there are such files.
+        PolarguideError: a folder contains files.
     """
     for folder in folders:
         files = [
@@ -134,17 +134,16 @@ def _refuse_strangers(folders: Iterable[Path]) -> None:
         if kinds:
             raise PolarguideError(
                 folder,
-                expected=f"shots in a format that is read ({', '.join(SHOT_SUFFIXES)})",
+                expected=f"shots in a supported format ({', '.join(SHOT_SUFFIXES)})",
                 found=", ".join(f"{count} of {kind}" for kind, count in kinds.most_common(3)),
                 remedy="Export them as 16-bit TIFF, linear if possible, or as JPEG of the highest quality.",
             )
 
 
 def group_files(files: Sequence[Path]) -> tuple[Candidates, list[Path]]:
-    """View -> angle -> files, by their names, and the files without an angle in their name.
+    """Return files by view and angle according to their names, and the files without an angle in their name.
 
-    Files named like the angles alone are one view, called like their folder, where a folder has nothing else among
-    the files.
+    Files named like the angles alone are one view, named like their folder, if the folder has no other files.
     """
     shots: Candidates = {}
     others: list[Path] = []
@@ -158,11 +157,11 @@ def group_files(files: Sequence[Path]) -> tuple[Candidates, list[Path]]:
                 continue
             view = canonical(folder.resolve().name) if alone else match["view"]
             shots.setdefault(view, {}).setdefault(int(match["angle"]), []).append(path)
-    return {view: dict(sorted(of_view.items())) for view, of_view in shots.items()}, others
+    return {view: dict(sorted(by_angle.items())) for view, by_angle in shots.items()}, others
 
 
 def ambiguity(view: str, files: Mapping[int, Sequence[Path]]) -> PolarguideError | None:
-    """The error that two files are one shot of a view; None where there is at most one an angle."""
+    """Return the error for two files of one shot of a view; None without such files."""
     for angle, (first, *more) in files.items():
         if more:
             return ambiguous(first.parent, f"one picture of {view} at {angle} degrees", first, more[0])
@@ -170,7 +169,7 @@ def ambiguity(view: str, files: Mapping[int, Sequence[Path]]) -> PolarguideError
 
 
 def require_four_shots(root: Path, shots: dict[str, dict[int, Path]]) -> None:
-    """Check that every view has its four shots.
+    """Require four shots of every view.
 
     Raises:
         PolarguideError: a shot is missing.
@@ -181,7 +180,7 @@ def require_four_shots(root: Path, shots: dict[str, dict[int, Path]]) -> None:
             root,
             expected="equal names of the four shots of a view in the four folders",
             found=f"{counts[0]} files in each, all under different names ({listed(sorted(shots))})",
-            remedy="Name the shots of a view alike; docs/how-to/prepare.md has a command that numbers them in order.",
+            remedy="Give the shots of a view one name; docs/how-to/prepare.md has a command that numbers them.",
         )
     for view, files in sorted(shots.items()):
         missing = [str(angle) for angle in ANGLES if angle not in files]
@@ -190,7 +189,7 @@ def require_four_shots(root: Path, shots: dict[str, dict[int, Path]]) -> None:
                 root,
                 expected=f"the shots of view {view} at 0, 45, 90 and 135 degrees",
                 found=f"none at {' and '.join(missing)}",
-                remedy="Add the file, or remove the other shots of the view (prepare --format singles takes any).",
+                remedy="Add the file, or remove the other shots of the view. prepare --format singles accepts any.",
             )
 
 
@@ -202,11 +201,11 @@ def read_stack(
     """Read the shots of a view, any number.
 
     Args:
-        paths: the files. gains: of R, G and B, for camera raw files.
-        levels: of their stored values; those of the files if None. Full scale becomes that of the files.
+        paths: the files. gains: gains of R, G and B, for camera raw files.
+        levels: levels of the stored values; None for those of the files. Full scale becomes that of the files.
 
     Raises:
-        PolarguideError: one cannot be read, or they differ in size, depth or orientation.
+        PolarguideError: a file cannot be read, or files differ in size, depth or orientation.
     """
     pictures: list[NDArray[Any]] = []
     first_code = None
@@ -220,7 +219,7 @@ def read_stack(
                 path,
                 expected=f"EXIF orientation {first_code} like {paths[0].name}",
                 found=str(code),
-                remedy="Keep the camera still between the shots of a view, or export all with the same settings.",
+                remedy="Do not move the camera between the shots of a view, or export all with the same settings.",
             )
     return stacked(np.stack(pictures), code, lossy=is_lossy(paths[0]), levels=levels)
 
@@ -228,14 +227,15 @@ def read_stack(
 def stacked(
     stack: NDArray[Any], orientation: int = 1, *, lossy: bool = False, levels: Levels | None = None
 ) -> Shots:
-    """The shots of a view of their stored values [K, H, W, 3].
+    """Return the shots of a view from their stored values [K, H, W, 3].
 
     Args:
-        orientation: EXIF's. lossy: whether they were compressed. levels: as for ``read_stack``.
+        stack: stored values. orientation: EXIF orientation.
+        lossy: True for files with lossy compression. levels: as in ``read_stack``.
     """
     full = int(np.iinfo(stack.dtype).max)
     limit = round(_LOSSY_FULL * full) if lossy else full
-    # By the largest of the three colors, written out: NumPy reduces a last axis of three slowly.
+    # The maximum of the three colors. NumPy reduces a last axis of three slowly.
     top = np.maximum(np.maximum(stack[..., 0], stack[..., 1]), stack[..., 2])
     if levels is not None:
         limit = min(limit, levels.saturation)
@@ -244,7 +244,7 @@ def stacked(
 
 
 def _read_shot(path: Path, gains: tuple[float, float, float]) -> tuple[NDArray[Any], int]:
-    """Stored values [H, W, 3] of a shot and its EXIF orientation."""
+    """Return stored values [H, W, 3] of a shot and its EXIF orientation."""
     if is_camera_raw(path):
         return read_camera_raw(path, gains)
     data = read_picture(path)
@@ -258,8 +258,8 @@ class SingleShot:
     Attributes:
         path: the file.
         view: its view; photographs of one view share their pose.
-        angle: angle of the filter, as the user counts it.
-        gain: exposure relative to the others, if the user knows it.
+        angle: stated angle of the filter.
+        gain: stated exposure relative to the others, or None.
     """
 
     path: Path
@@ -271,17 +271,17 @@ class SingleShot:
 def find_single_shots(
     root: Path, angles: str | None = None, each: int = 1
 ) -> tuple[list[SingleShot], list[Path]]:
-    """The photographs of a folder, sorted by view, and the tables that were read.
+    """Return the photographs of a folder, sorted by view, and the tables that were read.
 
-    The angle of each comes from the option, else from ``angles.csv`` in the folder, else from the folders in it
-    (``0``, ``30``, ``unknown``, ``none``, ...), else from the names of the files (``cup_045.jpg``, ``cup_a30.jpg``).
-    Files that share all of their name but the angle, and lines of a table with one view, are one view.
+    Angles come from the option, else from ``angles.csv`` in the folder, else from the subfolders (``0``, ``30``,
+    ``unknown``, ``none``, ...), else from the names of the files (``cup_045.jpg``, ``cup_a30.jpg``). Files whose names
+    differ only in the angle, and lines of a table with one view, are one view.
 
     Args:
         root: the folder.
-        angles: "unknown" or "none" for all, angles in the order of the names such as 0,60,120 that repeat, or the path
-            of a table.
-        each: consecutive photographs that are one view, called like the first, where the option says the angles.
+        angles: "unknown" or "none" for all, repeating angles in the order of the names such as 0,60,120, or the path of
+            a table.
+        each: number of consecutive photographs of a view, which is named like the first. It requires ``angles``.
 
     Raises:
         PolarguideError: a photograph has no angle or two, a file of the table does not exist, two photographs are one
@@ -291,15 +291,15 @@ def find_single_shots(
     if angles is not None and table.exists() and Path(angles).resolve() != table.resolve():
         raise PolarguideError(
             "--angles",
-            expected=f"nothing beside {table}, which says the angles",
+            expected=f"no --angles with {table}, which states the angles",
             found=angles,
-            remedy="Leave out the option, or move the table away.",
+            remedy="Omit the option, or move the table to another folder.",
         )
     if angles is not None and not angles.lower().endswith(".csv"):
-        return _checked(root, _all_alike(root, angles, each)), []
+        return _validated(root, _with_angles(root, angles, each)), []
     if angles is not None or table.exists():
         table = Path(angles) if angles is not None else table
-        return _checked(root, _by_table(root, table)), [table]
+        return _validated(root, _by_table(root, table)), [table]
     files = list_files(root, SHOT_SUFFIXES)
     shots = [
         SingleShot(path, stem, angle)
@@ -307,7 +307,7 @@ def find_single_shots(
         for stem, path in index_files(folder, SHOT_SUFFIXES).items()
     ]
     if shots:
-        return _checked(root, shots), []
+        return _validated(root, shots), []
     named = dict(zip(files, views_of_names(root, files), strict=True))
     without = [path.name for path, shot in named.items() if shot is None]
     if without:
@@ -317,14 +317,13 @@ def find_single_shots(
             found=f"{len(without)} of {len(files)} without an angle in their names ({listed(without)})",
             remedy=NAMING,
         )
-    shots = [SingleShot(path, *shot) for path, shot in named.items() if shot is not None]
-    return _checked(root, shots), []
+    return _validated(root, [SingleShot(path, *shot) for path, shot in named.items() if shot is not None]), []
 
 
 def views_of_names(folder: Path, files: Sequence[Path]) -> list[tuple[str, Angle] | None]:
     """Return the view and the angle that the names of files in a folder state; None for a name without them.
 
-    Files named like angles alone are one view, called like the folder, if all of them are named so.
+    Files named like angles alone are one view, named like the folder, if all of them have such names.
     """
     names = angles_of_names([stem_of(path) for path in files])
     alone = all(name is not None and not name[0] for name in names)
@@ -332,22 +331,22 @@ def views_of_names(folder: Path, files: Sequence[Path]) -> list[tuple[str, Angle
     return [(name[0] or own, name[1]) if name is not None and (name[0] or alone) else None for name in names]
 
 
-def _all_alike(root: Path, angles: str, each: int) -> list[SingleShot]:
-    """Photographs whose angles an option says: one word for all, or numbers that repeat; ``each`` to a view."""
+def _with_angles(root: Path, angles: str, each: int) -> list[SingleShot]:
+    """Return photographs with the angles of an option: one word for all, or repeating numbers; ``each`` per view."""
     repeating = [parse_angle(part) for part in angles.split(",")]
     if any(angle is None for angle in repeating):
         raise PolarguideError(
             "--angles",
             expected="'unknown', 'none', angles in the order of the files ('0,60,120'), or the path of a .csv table",
             found=repr(angles),
-            remedy="Give one of these four.",
+            remedy="Use one of these four.",
         )
     files = list(index_files(root, SHOT_SUFFIXES).values())
     period = max(each, len(repeating))
     if len(files) % period or len(repeating) not in (1, period):
         raise PolarguideError(
             "--angles",
-            expected=f"a number of photographs divisible by {period}, and one angle or {period} of them, which repeat",
+            expected=f"a number of photographs divisible by {period}, and one angle or {period} repeating angles",
             found=f"{len(files)} in {root} and {len(repeating)} angles",
             remedy=f"Add or remove photographs, or list the angle of each in {TABLE}.",
         )
@@ -363,7 +362,7 @@ def listed_pictures(root: Path, table: Path) -> tuple[list[tuple[Line, Path]], l
     """Return the lines of a table with the picture of each, and the pictures of the folder without a line.
 
     Raises:
-        PolarguideError: the table cannot be read, or names files outside of the folder or of other kinds.
+        PolarguideError: the table cannot be read, or names files outside of the folder or of other formats.
     """
     lines = read_table(table)
     rows = list(zip(lines, files_of(root, table, lines), strict=True))
@@ -375,8 +374,8 @@ def listed_pictures(root: Path, table: Path) -> tuple[list[tuple[Line, Path]], l
                 found=line.file,
                 remedy="Copy or convert the file, or remove the line.",
             )
-    taken = {path.resolve() for _, path in rows}
-    return rows, [path for path in list_files(root, SHOT_SUFFIXES) if path.resolve() not in taken]
+    in_table = {path.resolve() for _, path in rows}
+    return rows, [path for path in list_files(root, SHOT_SUFFIXES) if path.resolve() not in in_table]
 
 
 def _by_table(root: Path, table: Path) -> list[SingleShot]:
@@ -393,7 +392,7 @@ def _by_table(root: Path, table: Path) -> list[SingleShot]:
             raise PolarguideError(
                 table,
                 expected=f"the file {path}",
-                found="nothing of this name",
+                found="nothing with this name",
                 remedy="Correct the name, or remove the line.",
             )
         stem = stem_of(path)
@@ -405,16 +404,16 @@ def _by_table(root: Path, table: Path) -> list[SingleShot]:
             table,
             expected="a line for every photograph in the folder",
             found=f"none for {len(without)} ({listed([path.name for path in without])})",
-            remedy="Add the lines (angle unknown if it was not noted), or move the photographs away.",
+            remedy="Add the lines, with the angle unknown if it was not noted, or remove the photographs.",
         )
     return shots
 
 
-def _checked(root: Path, shots: list[SingleShot]) -> list[SingleShot]:
-    """The photographs, sorted by view and angle.
+def _validated(root: Path, shots: list[SingleShot]) -> list[SingleShot]:
+    """Return the photographs, sorted by view and angle.
 
     Raises:
-        PolarguideError: a name is no file's, or two photographs of a view have one angle.
+        PolarguideError: a view name is not a file name, or two photographs of a view have one angle.
     """
     first: dict[tuple[str, object], Path] = {}
     for shot in shots:
@@ -431,12 +430,11 @@ def _checked(root: Path, shots: list[SingleShot]) -> list[SingleShot]:
             )
         if shot.angle == "unknown":
             continue
-        key = (shot.view, shot.angle)  # half a turn apart, two pictures are as good as one taken twice
+        key = (shot.view, shot.angle)  # angles that differ by 180 degrees are repetitions and valid
         if key in first:
             at = "without a filter" if shot.angle == "none" else f"at {angle_text(shot.angle)} degrees"
             raise ambiguous(root, f"one photograph of {shot.view} {at}", first[key], shot.path)
         first[key] = shot.path
-
     return sorted(shots, key=lambda shot: (shot.view, *angle_order(shot.angle), shot.path.name))
 
 

@@ -1,4 +1,4 @@
-"""Read NumPy files and linear radiance (.hdr, .exr, .npy); sizes are checked before allocation."""
+"""Read NumPy files and linear pictures (.hdr, .exr, .npy). Sizes are checked before memory is allocated."""
 
 from __future__ import annotations
 
@@ -20,29 +20,28 @@ from polarguide.capture.formats.headers import LARGEST_PIXELS, damaged
 from polarguide.core.errors import PolarguideError, optional_import, require
 from polarguide.core.files import in_utf8, read_file
 
-_LARGEST_HEADER = 1 << 16
 BROKEN = (
     *(ValueError, TypeError, EOFError, OSError, MemoryError, SyntaxError, RuntimeError),
     *(tokenize.TokenError, zipfile.BadZipFile, zlib.error),
 )
-"""What decoding raises for files that are damaged, encrypted, or lie; NumPy parses headers as Python."""
+"""Errors of decoders for damaged, encrypted or contradictory files. NumPy parses headers as Python code."""
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
-# Largest uncompressed size of an ``.npz`` file of cameras, in bytes.
 _LARGEST_ARCHIVE = 1 << 26
+"""Largest uncompressed size of an ``.npz`` file of cameras, in bytes."""
 
 
 def array_size(array: NDArray[Any]) -> str:
-    """The shape of an array in words: "3x4"."""
+    """Format the shape of an array, such as "3x4"."""
     return "x".join(map(str, array.shape)) or "a single value"
 
 
 def array_kind(array: NDArray[Any]) -> str:
-    """Shape and type of an array in words, for messages."""
+    """Describe the shape and type of an array for messages."""
     return f"an array {array_size(array)} of {array.dtype}"
 
 
 def wrong_camera(where: object, expected: str, found: str) -> PolarguideError:
-    """The error that the numbers of a camera make no sense."""
+    """Return the error of invalid numbers of a camera."""
     return PolarguideError(where, expected=expected, found=found, remedy="Export the cameras again.")
 
 
@@ -57,10 +56,10 @@ def require_camera(condition: object, where: object, expected: str, found: str) 
 
 
 def read_array(path: Path) -> NDArray[Any]:
-    """The array in an ``.npy`` file.
+    """Read the array of an ``.npy`` file.
 
     Raises:
-        PolarguideError: the file cannot be read, is truncated or no ``.npy`` file, or holds Python objects.
+        PolarguideError: the file cannot be read, is truncated or of another kind, or has Python objects.
     """
     data = read_file(path)
     try:
@@ -74,7 +73,7 @@ def read_array(path: Path) -> NDArray[Any]:
 
 
 def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
-    """The arrays in an ``.npz`` file of cameras, by name; see ``decode_arrays``."""
+    """Read the arrays of an ``.npz`` file of cameras by name; see ``decode_arrays``."""
     return decode_arrays(path, read_file(path))
 
 
@@ -91,12 +90,15 @@ def decode_arrays(
     """Decode the arrays of an ``.npz`` file.
 
     Args:
-        path: for messages. data: the whole file.
-        names: names of the arrays, of which some may be missing; None: all. largest: bytes that they may take together.
-        kinds: types of their values, as NumPy calls them. expected, remedy: for messages.
+        path: path of the file for messages.
+        data: content of the file.
+        names: names of the requested arrays; missing arrays are ignored. Default: all arrays.
+        largest: largest uncompressed size in bytes.
+        kinds: accepted types of values as NumPy's kind codes.
+        expected, remedy: fields of the error.
 
     Raises:
-        PolarguideError: the file is damaged or encrypted, or decompresses to more data than ``largest``.
+        PolarguideError: the file is damaged or encrypted, or decompresses to more than ``largest`` bytes.
     """
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
@@ -115,19 +117,19 @@ def decode_arrays(
 
 
 def _member(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> bytes:
-    """A member of an archive. It may decompress to more than it states; no more than that is ever decompressed.
+    """Decompress a member of an archive, but no more bytes than its header states.
 
     Raises:
-        One of ``BROKEN``: it is damaged, or packed otherwise than NumPy packs: others decompress without a bound.
+        One of ``BROKEN``: the member is damaged, or has a compression without such a bound, which NumPy does not use.
     """
     if entry.compress_type not in _METHODS:
-        raise ValueError(f"{entry.filename} is packed in a way that NumPy does not use")
+        raise ValueError(f"{entry.filename} has a compression that NumPy does not use")
     with archive.open(entry) as packed:
         return packed.read(entry.file_size)
 
 
 def finite_numbers(where: object, array: object, shapes: tuple[tuple[int, ...], ...]) -> NDArray[np.float64]:
-    """An array of finite numbers in one of the shapes, as float64.
+    """Convert an array of finite numbers in one of the shapes to float64.
 
     Raises:
         PolarguideError: the array has another shape or type, or values that are not finite.
@@ -143,10 +145,10 @@ def finite_numbers(where: object, array: object, shapes: tuple[tuple[int, ...], 
 
 
 def array_header(stream: io.BytesIO) -> tuple[tuple[int, ...], np.dtype[Any]]:
-    """Shape and type in the header of ``.npy``; the stream is then behind it.
+    """Read shape and type from the header of ``.npy``; the stream ends up at the values.
 
     Raises:
-        One of ``BROKEN``: there is no such header.
+        One of ``BROKEN``: the header is invalid.
     """
     version = np.lib.format.read_magic(stream)
     read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
@@ -155,9 +157,9 @@ def array_header(stream: io.BytesIO) -> tuple[tuple[int, ...], np.dtype[Any]]:
 
 
 def _array(data: bytes, kinds: str) -> NDArray[Any]:
-    """Decode ``.npy``; a header that promises more than there is, is refused before memory is taken for it.
+    """Decode ``.npy``. A header that states more values than the file has is refused before memory is allocated.
 
-    ``kinds`` are the types of values that may be in it, as NumPy calls them.
+    ``kinds`` are the accepted types of values as NumPy's kind codes.
     """
     stream = io.BytesIO(data)
     shape, dtype = array_header(stream)
@@ -173,7 +175,7 @@ _EXR_MAGIC = b"\x76\x2f\x31\x01"
 
 
 def read_radiance(path: Path) -> NDArray[np.float32]:
-    """Read a linear picture; values may be negative or above 1, and are returned as they are.
+    """Read a linear picture. Values may be negative or above 1 and stay as they are.
 
     Args:
         path: Radiance ``.hdr``, OpenEXR ``.exr`` (package OpenEXR) or ``.npy`` with [H, W], [H, W, 1] or [H, W, 3].
@@ -188,7 +190,7 @@ def read_radiance(path: Path) -> NDArray[np.float32]:
     if suffix == ".hdr":
         pixels = _read_hdr(path)
     elif suffix == ".exr":
-        pixels = _read_exr(path, "RGB", "Y")
+        pixels = read_exr(path, "RGB", "Y")
     else:
         pixels = read_array(path)
     if pixels.ndim == 2:
@@ -205,11 +207,12 @@ def read_radiance(path: Path) -> NDArray[np.float32]:
 
 
 def _read_hdr(path: Path) -> NDArray[Any]:
+    """Read a Radiance picture, [H, W, 3]."""
     data = read_file(path)
     found = "an empty file" if not data else "a file of another kind"
     if (size := hdr_size(data)) is not None:
         found = f"one that is damaged or cut short (it ends after {len(data)} bytes)"
-        # Run lengths reach 127 pixels with two bytes a channel: fewer bytes than this cannot be complete.
+        # Compression is at most 127 pixels in two bytes per channel.
         if 0 < math.prod(size) <= min(LARGEST_PIXELS, 64 * len(data)):
             level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
             try:
@@ -223,48 +226,43 @@ def _read_hdr(path: Path) -> NDArray[Any]:
     raise damaged(path, "a complete Radiance HDR file", found)
 
 
-def _read_exr(path: Path, *choices: Sequence[str]) -> NDArray[Any]:
-    """The channels [H, W, C] of the first of the choices of names that an OpenEXR file has whole."""
+def read_exr(path: Path, *choices: Sequence[str]) -> NDArray[Any]:
+    """Read named channels [H, W, C] of an OpenEXR file: the first of the choices that is complete.
+
+    Raises:
+        PolarguideError: the file cannot be read, is damaged or lacks channels, or the package OpenEXR is missing.
+    """
     data = read_file(path)
     package = optional_import("OpenEXR", str(path))
     found = "an empty file" if not data else "one that is damaged, cut short or something else"
     if data.startswith(_EXR_MAGIC):
         try:
-            exr_size(path)  # the package takes memory for all pixels as it opens them
+            exr_size(path)  # the package allocates all pixels when it opens them
             with in_utf8(path) as name, package.File(str(name), separate_channels=True) as file:
                 channels = file.channels()
                 for names in choices:
                     if all(name in channels for name in names):
                         planes = [np.asarray(channels[name].pixels, np.float32) for name in names]
                         return np.stack(planes, axis=-1)
-        except Exception as error:  # the binding raises whatever C++ threw
+        except Exception as error:  # any C++ error
             found = f"one that is damaged or cut short ({str(error).strip().splitlines()[0]})"
-    names_wanted = ", or ".join(", ".join(names) for names in choices)
-    raise damaged(path, f"a complete OpenEXR file with channels {names_wanted}", found)
-
-
-def read_exr_channels(path: Path, groups: Sequence[Sequence[str]]) -> list[NDArray[np.float32]]:
-    """Named channels of an OpenEXR file, a picture [H, W, C] for each group of names.
-
-    Raises:
-        PolarguideError: the file cannot be read, is damaged or lacks a channel, or the package OpenEXR is missing.
-    """
-    return [_read_exr(path, names) for names in groups]
+    channels_text = ", or ".join(", ".join(names) for names in choices)
+    raise damaged(path, f"a complete OpenEXR file with channels {channels_text}", found)
 
 
 def hdr_size(data: bytes) -> tuple[int, int] | None:
-    """Width and height in the head of a Radiance file."""
-    # The size stands behind the first empty line; before it, anything may look like one.
+    """Return width and height in the header of a Radiance file."""
+    # The size follows the first empty line.
     size = _HDR_SIZE.match(data, data.find(b"\n\n", 0, 4096) + 2)
     return None if size is None or not data.startswith(b"#?") else (int(size[2]), int(size[1]))
 
 
 def exr_size(path: Path) -> tuple[int, int]:
-    """Width and height of the last window in the headers of an OpenEXR file, of which nothing is decoded.
+    """Return width and height of the last window in the headers of an OpenEXR file without decoding it.
 
     Raises:
         ValueError: a window is larger than any picture.
-        Exception: of several kinds, where the file is damaged.
+        Exception: the file is damaged; several kinds.
         PolarguideError: the package OpenEXR is missing.
     """
     package = optional_import("OpenEXR", str(path))

@@ -1,4 +1,4 @@
-"""Scoring a run on its test views, its speed, the sources of its numbers, and ``errors.png``: heat maps of errors."""
+"""Scores of a run on its test views, rendering speed, provenance of the numbers, and the error sheet ``errors.png``."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import statistics
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
@@ -20,9 +20,16 @@ from polarguide.capture.view import listed
 from polarguide.core.errors import PolarguideError
 from polarguide.core.progress import SILENT, Reporter
 from polarguide.core.system import peak_memory_mib
+from polarguide.gaussians.initialize import camera_reach
 from polarguide.geometry.camera import Camera
 from polarguide.optics import Mount
 from polarguide.optics.color import shown
+from polarguide.results.evaluation.coverage import (
+    Coverage,
+    DepthMap,
+    depth_map_of_rendering,
+    depth_map_of_truth,
+)
 from polarguide.results.evaluation.mesh import mesh_scores
 from polarguide.results.evaluation.metrics import HAZE_DEPTH, Selection, normal_angles_deg
 from polarguide.results.evaluation.record import METRICS_FILE, code_digest, commit, write_metrics
@@ -38,12 +45,18 @@ from polarguide.visualization.figures import Picture, contact_sheet
 
 ERRORS_FILE = "errors.png"
 MOST_VIEWS = 8
+"""Maximum number of views in the error sheet."""
 PICTURE_HIGH = 0.25
+"""Error of a displayed picture at the bright end of its heat map."""
 NORMAL_HIGH = 45.0
+"""Angle at the bright end of the heat map of normals, in degrees."""
 BRIGHTEST = (0.05, 0.5)
-"""Between these lies the DoLP from which its pictures are fully bright."""
+"""Bounds of the DoLP that a picture of polarization shows at full brightness."""
 MAP = "inferno"
 NOT_COUNTED = 90
+"""Gray level of pixels outside the mask of a score."""
+STRIPES = 48
+"""Number of stripes across a picture. They mark pixels whose content no training view shows."""
 COLUMNS = {
     "photograph": "photograph",
     "final": "picture error",
@@ -54,29 +67,55 @@ COLUMNS = {
     "predicted": "predicted",
     "stokes": "S1, S2 error",
 }
-"""Heading of each column by its key; one that a run has nothing for is left out."""
+"""Heading of each column of the error sheet. A column without pictures is left out."""
+
+
+class _SheetRow(NamedTuple):
+    """Row of the error sheet.
+
+    Attributes:
+        name: name of the view. pictures: pictures by column.
+        measured: [3, H, W, 3] measured Stokes vectors; None if the pictures do not determine them.
+        predicted: [3, H, W, 3] predicted Stokes vectors; None without a prediction.
+        mask: [H, W] pixels whose polarization counts. unseen: [H, W] pixels that no training view shows.
+    """
+
+    name: str
+    pictures: dict[str, Picture]
+    measured: Tensor | None
+    predicted: Tensor | None
+    mask: Tensor
+    unseen: Tensor
 
 
 class ErrorSheet:
-    """Pictures of the errors of some views, one row each, and below each column the key to its colors.
+    """Sheet of error maps: one row per view, one color key per column.
 
-    Heat maps are black at no error and bright at the end of their scale; what does not count is gray. Layers and
-    picture: mean over channels of the absolute difference of shown values. Polarization: angle of the field as hue,
-    degree as brightness, of the channels' mean Stokes vector; its error is the mean over channels of |S1 error| + |S2
-    error|. Its scales end at about what a tenth of the pixels measure or more.
+    Heat maps are black at zero error and bright at the end of their scale. Pixels without a score are gray.
+    Gray stripes in the error of picture and polarization mark pixels whose content no training view shows.
+
+    - Layers and picture: absolute difference of displayed values, mean over channels.
+    - Polarization: mean Stokes vector of the channels, with AoLP as hue and DoLP as brightness.
+    - Error of polarization: |S1 error| + |S2 error|, mean over channels.
+
+    The scales of polarization end near the 90th percentile of the measured values.
 
     Args:
-        views: how many there will be; ``MOST_VIEWS`` of them, evenly chosen, are drawn.
+        views: number of views. At most ``MOST_VIEWS`` of them, at equal distances, are drawn.
     """
 
     def __init__(self, views: int) -> None:
         self._chosen = range(0, views, max(1, math.ceil(views / MOST_VIEWS)))
         self._added = 0
-        # Name, pictures, measured and predicted Stokes vectors, and where they count: scales depend on all views.
-        self._rows: list[tuple[str, dict[str, Picture], Tensor | None, Tensor | None, Tensor]] = []
+        self._rows: list[_SheetRow] = []
 
     def add(self, view: View, target: ViewTarget, result: RenderResult, stokes: Tensor | None) -> None:
-        """Add the next view, if it is one of those that are drawn; ``stokes`` [3, H, W, 3] as it is predicted."""
+        """Add the next view if the sheet draws it.
+
+        Args:
+            view: the test view. target: its ground truth. result: its rendering.
+            stokes: [3, H, W, 3] predicted Stokes vectors; None without a prediction.
+        """
         self._added += 1
         if self._added - 1 not in self._chosen:
             return
@@ -92,24 +131,24 @@ class ErrorSheet:
         if "normal" in result.layers and target.normal is not None and target.surface is not None:
             angles = normal_angles_deg(result.normal.nan_to_num(), target.normal)
             pictures["normal"] = _heat(angles, target.surface.mask, NORMAL_HIGH)
+        unseen = target.unseen.cpu()
+        _hatch(pictures["final"], unseen)
         keep = target.valid if target.polarized is None else target.polarized
         predicted = None if stokes is None else stokes.cpu().nan_to_num()
         measured = view.stokes() if view.is_determined else None
-        self._rows.append((view.name, pictures, measured, predicted, keep.mask.cpu()))
+        self._rows.append(_SheetRow(view.name, pictures, measured, predicted, keep.mask.cpu(), unseen))
 
     def write(self, path: Path) -> None:
-        """Write the sheet; nothing where no view was added."""
+        """Write the sheet, or no file if it has no view."""
         if not self._rows:
             return
         ends = {**dict.fromkeys(("final", "specular", "diffuse"), PICTURE_HIGH), "normal": NORMAL_HIGH}
         headings = dict(COLUMNS)
-        if any(measured is not None and predicted is not None for _, _, measured, predicted, _ in self._rows):
+        if any(row.measured is not None and row.predicted is not None for row in self._rows):
             brightest, ends["stokes"] = self._draw_polarization()
             headings["measured"] = f"AoLP x DoLP / {brightest:g}"
-        keys = [key for key in COLUMNS if any(key in pictures for _, pictures, *_ in self._rows)]
-        rows: list[list[Picture | None]] = [
-            [pictures.get(key) for key in keys] for _, pictures, *_ in self._rows
-        ]
+        keys = [key for key in COLUMNS if any(key in row.pictures for row in self._rows)]
+        rows: list[list[Picture | None]] = [[row.pictures.get(key) for key in keys] for row in self._rows]
         bars = {
             key: figures.scale_bar(0.0, end, MAP, "deg" if key == "normal" else "")
             for key, end in ends.items()
@@ -118,25 +157,26 @@ class ErrorSheet:
         bars["photograph"] = figures.color_patch(NOT_COUNTED, "gray: not counted")
         sheet = contact_sheet(
             rows,
-            [name for name, *_ in self._rows],
+            [row.name for row in self._rows],
             [headings[key] for key in keys],
             footer=[bars[key] for key in keys],
         )
         figures.write_png(path, sheet)
 
     def _draw_polarization(self) -> tuple[float, float]:
-        """Add the pictures of the polarization; the DoLP that is fully bright, and the end of the errors' scale."""
-        counted = [measured[:, keep] for _, _, measured, _, keep in self._rows if measured is not None]
+        """Add the pictures of polarization; return the DoLP at full brightness and the end of the error scale."""
+        counted = [row.measured[:, row.mask] for row in self._rows if row.measured is not None]
         degrees = torch.cat([optics.dolp(optics.luminance(values)) for values in counted])
-        brightest = min(max(_tenth_above(degrees), BRIGHTEST[0]), BRIGHTEST[1])
-        high = _tenth_above(torch.cat([_size(values) for values in counted]))
-        for _, pictures, measured, predicted, keep in self._rows:
+        brightest = min(max(_rounded_percentile(degrees), BRIGHTEST[0]), BRIGHTEST[1])
+        high = _rounded_percentile(torch.cat([_polarization_magnitude(values) for values in counted]))
+        for _, pictures, measured, predicted, keep, unseen in self._rows:
             if measured is None:
                 continue
             pictures["measured"] = _polarization(measured, brightest)
             if predicted is not None:
                 pictures["predicted"] = _polarization(predicted, brightest)
-                pictures["stokes"] = _heat(_size(predicted - measured), keep, high)
+                pictures["stokes"] = _heat(_polarization_magnitude(predicted - measured), keep, high)
+                _hatch(pictures["stokes"], unseen)
         return brightest, high
 
 
@@ -151,8 +191,17 @@ def _heat(values: Tensor, keep: Tensor, high: float) -> Picture:
     return picture
 
 
-def _size(stokes: Tensor) -> Tensor:
-    """Mean over channels of |S1| + |S2| of [3, ..., C]."""
+def _hatch(picture: Picture, unseen: Tensor) -> None:
+    """Draw diagonal stripes over the pixels [H, W] whose content no training view shows."""
+    height, width = unseen.shape
+    diagonal = torch.arange(height)[:, None] + torch.arange(width)
+    spacing = max(4, width // STRIPES)
+    stripes = unseen & (diagonal % spacing < spacing // 4)
+    picture[stripes.numpy()] = NOT_COUNTED
+
+
+def _polarization_magnitude(stokes: Tensor) -> Tensor:
+    """Return |S1| + |S2| of Stokes vectors [3, ..., C], mean over channels."""
     return stokes[1:].abs().sum(dim=0).mean(dim=-1)
 
 
@@ -161,8 +210,8 @@ def _polarization(stokes: Tensor, brightest: float) -> Picture:
     return figures.aolp_to_rgb(optics.aolp(mean), (optics.dolp(mean) / brightest).clamp(max=1))
 
 
-def _tenth_above(values: Tensor) -> float:
-    """About what a tenth of the values reach: rounded up to 1, 2 or 5 times a power of ten, at least 0.001."""
+def _rounded_percentile(values: Tensor) -> float:
+    """Round the 90th percentile of values up to 1, 2 or 5 times a power of ten, at least 0.001."""
     ordered = values.flatten().sort().values
     value = max(float(ordered[int(0.9 * (len(ordered) - 1))]) if len(ordered) else 0.0, 1e-3)
     power = 10.0 ** math.floor(math.log10(value))
@@ -171,19 +220,19 @@ def _tenth_above(values: Tensor) -> float:
 
 @torch.no_grad()
 def cross_fitted(view: View, final: Tensor, stokes: Tensor | None) -> Tensor:
-    """Predicted photograph of a view whose pictures were taken through a filter and do not measure S0.
+    """Predict the photograph of a view whose pictures do not determine S0.
 
-    Gain, angle and strength of the analyzer are not known, so they are fitted (``training.angles.fit``): on the left
-    half of the picture to predict the right one, and on the right half to predict the left one. No pixel is scored by
-    a fit that used it.
+    Gain, angle and modulation of the analyzer are unknown and are fitted (``training.angles.fit``). The fit
+    on the left half of the picture predicts the right half, and the reverse. So no pixel is scored by a fit
+    that used it.
 
     Args:
         view: the view.
         final: [H, W, 3] rendered S0/2.
-        stokes: [3, H, W, 3] predicted Stokes vectors; None: the gain alone is fitted.
+        stokes: [3, H, W, 3] predicted Stokes vectors; None fits only the gain.
 
     Returns:
-        [H, W, 3] linear, on the device of ``final``.
+        [H, W, 3] linear radiance, on the device of ``final``.
     """
     local = view.to(final.device)
     measured = local.photograph().to(final)
@@ -193,13 +242,15 @@ def cross_fitted(view: View, final: Tensor, stokes: Tensor | None) -> Tensor:
     predicted = torch.cat((2 * final[None], polarized)).nan_to_num(nan=0.0, posinf=0.0, neginf=0.0)
     left = torch.arange(final.shape[1], device=final.device) < final.shape[1] // 2
     by_right, by_left = (
-        _behind(measured, predicted, good * half, rays, view.mount) for half in (~left, left)
+        _behind_fitted_analyzer(measured, predicted, good * half, rays, view.mount) for half in (~left, left)
     )
     return torch.where(left[None, :, None], by_right, by_left)
 
 
-def _behind(measured: Tensor, stokes: Tensor, weight: Tensor, rays: Tensor, mount: Mount) -> Tensor:
-    """The whole picture behind the analyzer that fits where the weight is."""
+def _behind_fitted_analyzer(
+    measured: Tensor, stokes: Tensor, weight: Tensor, rays: Tensor, mount: Mount
+) -> Tensor:
+    """Predict all pixels [H, W, 3] behind the analyzer that fits the weighted pixels."""
     angle = fit_angle(measured, stokes, weight, rays, mount)
     if angle is None:
         counted = weight[..., None]
@@ -211,17 +262,19 @@ def _behind(measured: Tensor, stokes: Tensor, weight: Tensor, rays: Tensor, moun
 
 
 MINIMUM_SECONDS = 1.5
+"""Minimum duration of a measurement of speed, in seconds."""
 MOST_SECONDS = 40.0
-HELD_MORE = "the process had held more memory before it scored"
-NOT_ALONE = "other work ran on the machine meanwhile"
+"""Expected duration in seconds above which views are timed once and not all of them."""
+NO_PEAK = "the process used more memory before scoring"
+OTHER_WORK = "other work ran on the machine at the same time"
 
 
 class ScoredModel(Protocol):
-    """A trained model as far as scores need it; see ``runs.model.GaussianModel``."""
+    """Interface of a trained model for scoring; ``runs.model.GaussianModel`` implements it."""
 
     @property
     def device(self) -> torch.device:
-        """Where it renders."""
+        """Device of the rendering."""
 
     @property
     def gaussians(self) -> int | None:
@@ -230,37 +283,37 @@ class ScoredModel(Protocol):
     def render(
         self, camera: Camera, *, normals: bool = True, depth: bool = False, surface: bool = False
     ) -> RenderResult:
-        """Render all layers."""
+        """Render the layers of a view."""
 
     def stokes(self, result: RenderResult, camera: Camera) -> Tensor | None:
-        """Predict Stokes vectors; None where the model predicts none."""
+        """Predict Stokes vectors [3, H, W, 3]; None without a prediction."""
 
     def alpha_in_front(self, camera: Camera, depth: Tensor) -> Tensor:
-        """Share of each pixel's alpha nearer than a depth."""
+        """Return the share of each pixel's alpha in front of a depth [H, W]."""
 
 
 class ScoredRun(Protocol):
-    """A run as far as scores need it; see ``runs.opened.OpenedRun``."""
+    """Interface of a run for scoring; ``runs.opened.OpenedRun`` implements it."""
 
     @property
     def folder(self) -> Path:
-        """The run folder."""
+        """Run folder."""
 
     @property
     def configuration(self) -> RunConfiguration:
-        """The record of the run."""
+        """Configuration of the run."""
 
     @property
     def model(self) -> ScoredModel:
-        """The trained model."""
+        """Trained model."""
 
     @property
     def scene(self) -> Scene:
-        """The scene."""
+        """Scene of the run."""
 
     @property
     def steps(self) -> int:
-        """Number of trained steps."""
+        """Number of training steps."""
 
     @property
     def cameras(self) -> dict[str, Camera]:
@@ -274,60 +327,63 @@ def evaluate(
     surface: Callable[[], Surface] | None = None,
     reporter: Reporter = SILENT,
 ) -> dict[str, Any]:
-    """Score a run's test views and write ``metrics.json`` and ``errors.png`` into its folder.
+    """Score the test views of a run and write ``metrics.json`` and ``errors.png`` into its folder.
 
     Args:
-        run: the run; only its layers are used.
-        speed: whether to measure frames a second, which makes sense only while nothing else runs.
-        surface: computes the surface for mesh scores; None: depth maps are fused.
-        reporter: receives progress.
+        run: the run. Only its layers are used.
+        speed: measure frames per second. Other work on the machine makes this measurement invalid.
+        surface: computes the surface for the mesh scores; None fuses the depth maps.
+        reporter: receives progress and warnings.
 
     Returns:
-        The record as written: means over the views, ``views`` by name, ``objects``, ``materials`` and ``provenance``.
+        The record in ``metrics.json``: means over the views, ``views`` by name, ``objects``, ``materials``
+        and ``provenance``.
 
     Raises:
-        PolarguideError: the scene cannot be read, or has no test views.
+        PolarguideError: the scene cannot be read or has no test views.
     """
-    held_before = peak_memory_mib()
+    peak_before = peak_memory_mib()
     tests = run.scene.test_views
     if not tests:
         raise PolarguideError(
             run.scene.root,
-            expected="test views to score the run on",
-            found="none: it was trained on all views",
-            remedy='Name some in split.json, {"test": ["<view>", ...]}, and train again.',
+            expected="at least one test view",
+            found="none: all views were used for training",
+            remedy='List test views in split.json, {"test": ["<view>", ...]}, and train again.',
         )
     facts = SceneFacts.of(run.scene)
     for warning in facts.warnings:
         reporter.warn(warning)
     fitted = [view.name for view in tests if not view.measures_radiance]
     if fitted:
-        reporter.say(
-            f"scored behind an analyzer that is fitted on the other half of the picture: {listed(fitted)}"
-        )
+        reporter.say(f"scored with an analyzer fitted on the other half of the picture: {listed(fitted)}")
+    coverage = _coverage(run, reporter)
     views = {}
     by_object = ErrorsByObject(facts.objects)
     sheet = ErrorSheet(len(tests))
     with reporter.track("scoring", len(tests)) as advance:
         for view in tests:
-            views[view.name] = _score(run, view, facts, by_object, sheet)
+            views[view.name] = _score(run, view, facts, coverage.seen[view.name], by_object, sheet)
             advance(len(views))
     sheet.write(run.folder / ERRORS_FILE)
-    memory = _peak(held_before)  # before the mesh, which is no part of what a run needs
+    memory = _peak_memory(peak_before)  # The mesh scores below are not part of rendering.
     with reporter.track("measuring the mesh"):
-        mesh = mesh_scores(surface or (lambda: _fused(run)), tests)
+        mesh = mesh_scores(surface or (lambda: _fuse_depths(run)), tests)
     objects, materials = by_object.records()
     seconds, alone = RunLog(run.folder).elapsed()
+    timed = alone and seconds > 0
+    no_time = "the run has no training log" if alone else OTHER_WORK
     fps = _speed(run, normals=False) if speed else None
+    no_speed = OTHER_WORK if speed else "not requested"
     return write_metrics(
         run.folder / METRICS_FILE,
         views=views,
         run={
             "fps": fps,
-            "fps_reason": None if fps is not None else NOT_ALONE if speed else "not requested",
+            "fps_reason": no_speed if fps is None else None,
             "fps_layers": _speed(run, depth=True) if speed else None,
-            "train_seconds": seconds if alone and seconds > 0 else None,
-            "train_seconds_reason": None if alone and seconds > 0 else "no log of it" if alone else NOT_ALONE,
+            "train_seconds": seconds if timed else None,
+            "train_seconds_reason": None if timed else no_time,
             "gaussians": run.model.gaussians,
             "steps": run.steps,
             **memory,
@@ -339,12 +395,47 @@ def evaluate(
     )
 
 
+def _coverage(run: ScoredRun, reporter: Reporter) -> Coverage:
+    """Find the pixels of the test views whose content a training view shows.
+
+    Depths of test views come from the ground truth where it has them. All others are rendered.
+    """
+    scene = run.scene
+    training = scene.train_views
+    centers = torch.stack([view.camera.center for view in training])
+    middle, radius = camera_reach(
+        (scene.points if len(scene.points) else centers).double().numpy(), centers.numpy()
+    )
+
+    def surface(view: View) -> DepthMap:
+        result = run.model.render(view.camera, normals=False, depth=True, surface=True)
+        return depth_map_of_rendering(
+            view.camera, result.depth, result.alpha, torch.from_numpy(middle), radius
+        )
+
+    held_out = {}
+    for view in scene.test_views:
+        truth = view.ground_truth
+        known = None if truth is None else truth.depth
+        held_out[view.name] = surface(view) if known is None else depth_map_of_truth(view.camera, known)
+    coverage = Coverage(held_out)
+    with reporter.track("finding the photographed pixels", len(training)) as advance:
+        for count, view in enumerate(training, start=1):
+            coverage.add(surface(view))
+            advance(count)
+    return coverage
+
+
 def _score(
-    run: ScoredRun, view: View, facts: SceneFacts, by_object: ErrorsByObject, sheet: ErrorSheet
+    run: ScoredRun,
+    view: View,
+    facts: SceneFacts,
+    seen: Tensor,
+    by_object: ErrorsByObject,
+    sheet: ErrorSheet,
 ) -> ViewScores:
-    """Score a view; its errors are added to those by object, and its pictures to the sheet."""
-    # First what is known of it: copied later, it would have to wait until the rendering is done.
-    target = ViewTarget.of_view(view, facts, run.model.device)
+    # The target comes first: a later copy to the device would wait for the rendering.
+    target = ViewTarget.of_view(view, facts, run.model.device).with_coverage(seen)
     result = run.model.render(view.camera, depth=True, surface=True)
     stokes = run.model.stokes(result, view.camera)
     if not view.measures_radiance:
@@ -356,18 +447,17 @@ def _score(
     return score_view(target, result, stokes=stokes, in_front=in_front, by_object=by_object)
 
 
-def _peak(before: float | None) -> dict[str, Any]:
-    """The most memory that this process has held since it had held ``before`` at most, in MiB."""
+def _peak_memory(before: float | None) -> dict[str, Any]:
+    """Return the peak memory of this process in MiB if it exceeds the peak ``before`` the scoring."""
     peak = peak_memory_mib()
     if peak is None or before is None:
-        return {"peak_memory_mib": None, "peak_memory_mib_reason": "the system does not tell"}
-    if peak == before:  # as after a training in this process
-        return {"peak_memory_mib": None, "peak_memory_mib_reason": HELD_MORE}
+        return {"peak_memory_mib": None, "peak_memory_mib_reason": "the operating system does not report it"}
+    if peak == before:  # for example after a training in this process
+        return {"peak_memory_mib": None, "peak_memory_mib_reason": NO_PEAK}
     return {"peak_memory_mib": peak, "peak_memory_mib_reason": None}
 
 
-def _fused(run: ScoredRun) -> Surface:
-    """The surface that the depth maps of all views give."""
+def _fuse_depths(run: ScoredRun) -> Surface:
     surface, _, _ = fused_surface(
         run.cameras, lambda camera: run.model.render(camera, depth=True, surface=True), resolution=RESOLUTION
     )
@@ -406,17 +496,18 @@ def _provenance(run: ScoredRun) -> dict[str, Any]:
 
 
 def frames_per_second(draw: Callable[[View], object], views: Sequence[View]) -> float | None:
-    """Median over views of 1 / seconds for ``draw``, after one warm-up of each; nothing is waited for but the call.
+    """Measure the median over views of 1 / seconds for ``draw``.
 
-    Where that would take longer than ``MOST_SECONDS``, as with pictures that take seconds each, as many views as fit
-    into it are timed once, after a warm-up of the first.
+    Each view is drawn once without timing and then at least three times. If this would take longer than
+    ``MOST_SECONDS``, only the first view is warmed up, and as many views as fit into that time are timed
+    once.
 
     Args:
-        draw: renders one view and returns when it is done.
-        views: what to render; each is timed at least three times.
+        draw: renders one view and returns after the rendering is complete.
+        views: the views.
 
     Returns:
-        Frames a second, or None where other work ran on the machine meanwhile.
+        Frames per second; None if other work ran on the machine at the same time.
     """
     first = _seconds(draw, views[0])
     rounds = 3

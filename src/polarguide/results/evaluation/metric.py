@@ -1,7 +1,8 @@
-"""A metric: its name, unit and direction, and its function on a view. Other packages add theirs.
+"""Description of a metric: name, unit, direction, and function on a view. Installed packages can add metrics.
 
-Entry points of the group ``polarguide.metrics`` name a ``Metric`` of views, a sequence of them, or a function without
-arguments that returns either. One that cannot be used is left out with a warning: scores do not depend on it.
+An entry point of the group ``polarguide.metrics`` names a ``Metric`` of views, a sequence of them, or a
+function without arguments that returns either. An invalid entry point is left out with a warning, because
+scores do not depend on it.
 """
 
 from __future__ import annotations
@@ -20,27 +21,33 @@ from polarguide.core.records import decode
 from polarguide.results.evaluation.target import ViewTarget
 
 Layers = Mapping[str, Tensor | None]
-"""Rendered layers of a view by name: ``final``, ``normal``, ``specular``, ``diffuse``, ``depth``, ``alpha``, the
-predicted ``polarization`` and the weight ``in_front`` of the surface; None where there is none."""
+"""Rendered layers of a view by name, None if missing.
+
+They are ``final``, ``normal``, ``specular``, ``diffuse``, ``depth``, ``alpha``, the predicted
+``polarization`` and the alpha ``in_front`` of the surface.
+"""
 Measure = Callable[[ViewTarget, Layers], Tensor | None]
-"""A metric of one view as a tensor []; None where it is not defined. In place of decibels the mean squared error."""
+"""Function that computes a metric of a view as a tensor [], or None if it is undefined.
+
+A metric in decibels returns the mean squared error.
+"""
 
 
 @dataclass(frozen=True)
 class Metric:
-    """One quantity of a run.
+    """A quantity of a run.
 
     Attributes:
-        key: its name in ``metrics.json``.
-        label: what people read. unit: after the value; empty for none.
+        key: name in ``metrics.json``.
+        label: displayed name. unit: displayed unit, or an empty text.
         digits: decimal places in tables.
-        better: which direction is better; None: neither, and nothing is set in bold.
-        of: whether each view has a value, and a run their mean, or only the run.
-        measure: its value on a view; None where it is not a single tensor (LPIPS, FLIP), or not of a view.
-        shown: "tables": console, Markdown, LaTeX and the report have it; "files": only CSV and ``results.json``;
+        better: the better direction; None for neither, without bold type in tables.
+        of: "view" for a value per view and their mean for the run; "run" for one value per run.
+        measure: computes the value of a view; None for LPIPS, FLIP and metrics of a run.
+        shown: "tables": console, Markdown, LaTeX and report; "files": only CSV and ``results.json``;
             "record": only ``metrics.json``.
-        timed: whether it counts only when measured alone; such a value may be absent without a fault.
-        factor: what the value is multiplied by in tables.
+        timed: the value is valid only without other work on the machine, and may be missing.
+        factor: scale of the displayed value.
     """
 
     key: str
@@ -56,7 +63,7 @@ class Metric:
 
     @property
     def arrow(self) -> str:
-        """Points to the better side; empty where there is none."""
+        """Arrow toward the better side, or an empty text."""
         return {"higher": "↑", "lower": "↓", None: ""}[self.better]
 
     @property
@@ -65,18 +72,22 @@ class Metric:
         return " ".join(filter(None, (self.label, f"({self.unit})" if self.unit else "", self.arrow)))
 
     def text(self, value: float) -> str:
-        """A recorded value as the console shows it."""
+        """Format a recorded value for the console."""
         number = f"{value:,}" if isinstance(value, int) else f"{self.factor * value:.3f}"
         return f"{number} {self.unit}".rstrip()
 
 
 GROUP = "polarguide.metrics"
-_REMEDY = "Update or uninstall the package that brings it."
+_REMEDY = "Update or uninstall the package of the plug-in."
 _KINDS = get_type_hints(Metric) | {"digits": Annotated[int, msgspec.Meta(ge=0, le=10)]}
 
 
 def plugged_metrics(known: Collection[str]) -> tuple[Metric, ...]:
-    """The metrics of installed packages, in the order of their keys; ``known``: keys that they cannot have."""
+    """Return the metrics of installed packages, sorted by key.
+
+    Args:
+        known: keys of the built-in metrics, which a package must not reuse.
+    """
     plugged: dict[str, Metric] = {}
     for entry in entry_points(group=GROUP):
         try:
@@ -85,27 +96,29 @@ def plugged_metrics(known: Collection[str]) -> tuple[Metric, ...]:
                     raise _unusable(entry, "a key that no other metric has", metric.key)
                 plugged[metric.key] = metric
         except PolarguideError as error:
-            warnings.warn(f"{error} Its metrics are left out.", PolarguideWarning, stacklevel=2)
+            warnings.warn(f"{error} The plug-in's metrics are left out.", PolarguideWarning, stacklevel=2)
     return tuple(plugged[key] for key in sorted(plugged))
 
 
 def _loaded(entry: EntryPoint) -> tuple[Metric, ...]:
-    """The metrics of an entry point.
+    """Load the metrics of an entry point.
 
     Raises:
-        PolarguideError: the entry point cannot be loaded, or is no metric.
+        PolarguideError: the entry point cannot be loaded or is not a metric.
     """
     try:
         loaded: Any = entry.load()
         loaded = loaded() if callable(loaded) else loaded
         metrics = (loaded,) if isinstance(loaded, Metric) else tuple(loaded)
-    except (Exception, SystemExit) as error:  # another package may fail in any way
+    except (Exception, SystemExit) as error:  # Another package may raise anything.
         raise _unusable(entry, "metrics", f"{type(error).__name__}: {error}") from error
     for metric in metrics:
         if not isinstance(metric, Metric):
             raise _unusable(entry, "metrics", repr(metric))
         if not callable(metric.measure) or metric.of != "view" or not str(metric.key).isidentifier():
-            raise _unusable(entry, "a metric of views with a measure, its key a name", repr(metric.key))
+            raise _unusable(
+                entry, "a metric of views with a measure and an identifier as key", repr(metric.key)
+            )
         for name in ("label", "unit", "digits", "better", "shown", "timed", "factor"):
             where = f"plug-in {entry.name} ({entry.value}), {metric.key} ({name})"
             decode(getattr(metric, name), _KINDS[name], where, remedy=_REMEDY)
@@ -115,7 +128,7 @@ def _loaded(entry: EntryPoint) -> tuple[Metric, ...]:
 
 
 class _Guarded:
-    """A measure of another package: where it fails, there is no value, and one warning; scores do not depend on it."""
+    """Measure of another package. A failure gives no value and one warning, because scores do not depend on it."""
 
     def __init__(self, entry: EntryPoint, measure: Measure) -> None:
         self._entry = entry
@@ -123,8 +136,7 @@ class _Guarded:
         self._failed = False
 
     def __call__(self, target: ViewTarget, layers: Layers) -> Tensor | None:
-        """The value as a tensor [] on the target's device; None where there is none."""
-        found = ""
+        """Compute the value as a tensor [] on the target's device, or None."""
         try:
             value: Any = self._measure(target, layers)
             if value is None:
@@ -140,7 +152,7 @@ class _Guarded:
         if not self._failed:
             self._failed = True
             fault = _unusable(self._entry, "a real tensor [] or None from its measure", found)
-            warnings.warn(f"{fault} It has no value.", PolarguideWarning, stacklevel=2)
+            warnings.warn(f"{fault} The metric has no value.", PolarguideWarning, stacklevel=2)
         return None
 
 

@@ -1,9 +1,11 @@
-"""The metrics of pictures, layers, normals, polarization, depth and coverage: one definition each.
+"""Metrics of pictures, layers, normals, polarization, depth and coverage: one definition each.
 
-Pictures are linear radiance [H, W, 3] on the exposure of the photograph (S0/2). "Shown" means clipped to [0, 1] and
-sRGB-encoded; every picture metric compares shown pictures with peak 1. Pixels outside ``keep`` are left out of every
-metric, whatever they hold. All arithmetic is float64, on the device of the prediction, and results stay there, as
-tensors [] of float64: a caller that wants several reads them at once.
+Pictures are linear radiance [H, W, 3] at the exposure of the photograph (S0/2). Displayed pictures are
+clipped to [0, 1] and sRGB-encoded. All picture metrics compare displayed pictures with peak 1. Pixels outside
+``keep`` have no influence on any metric.
+
+The arithmetic is float64 on the device of the prediction. Results are tensors [] of float64 on that device,
+so that a caller can read several of them with one transfer.
 """
 
 from __future__ import annotations
@@ -21,13 +23,13 @@ from polarguide.training.photometric import SSIM_WINDOW, gaussian_window, struct
 
 @dataclass(frozen=True, eq=False)
 class Selection:
-    """Pixels that count, as a mask and by their numbers.
+    """Pixels to score, as a mask and as indices.
 
-    A device that picks by a mask has to count it first, and whoever asked waits for the answer. So masks are counted on
-    the CPU, where they come from, and pixels are picked by number: the same ones in the same order.
+    Picking by a mask on a device counts the mask there and makes the CPU wait. So masks are counted on the
+    CPU, and pixels are picked by index, in the order of the rows.
 
     Attributes:
-        mask: [H, W] bool. places: [P] int64, the pixels in it, counted along the rows.
+        mask: [H, W] bool. places: [P] int64, indices of the pixels in the mask.
     """
 
     mask: Tensor
@@ -35,47 +37,49 @@ class Selection:
 
     @classmethod
     def of(cls, mask: Tensor, device: torch.device) -> Selection:
-        """The pixels of a mask [H, W] bool, on a device; the mask itself should lie on the CPU."""
+        """Create a selection on a device from a mask [H, W] bool, which should be on the CPU."""
         return cls(mask.to(device), mask.flatten().nonzero()[:, 0].to(device))
 
     def pick(self, values: Tensor) -> Tensor:
-        """[P, ...] of values [H, W, ...] on the same device."""
+        """Return the selected values [P, ...] of values [H, W, ...] on the same device."""
         return values.flatten(0, 1).index_select(0, self.places)
 
 
 Keep = Tensor | Selection | None
 REFLECTIVE_SHARE = 0.3
+"""Share of the specular lobe in S0 above which a pixel counts as reflective."""
 CLOSE_NORMAL_DEG = 11.25
+"""Angle in degrees below which a normal counts as close."""
 SHORTEST = 1e-12
-"""Vectors that are not longer have no direction."""
+"""Length at or below which a vector has no direction."""
 
 
 def psnr(pred_linear: Tensor, true_linear: Tensor, keep: Keep = None) -> float:
-    """Peak signal-to-noise ratio of shown pictures: ``decibels`` of their ``squared_error``, waited for."""
+    """Compute the peak signal-to-noise ratio of displayed pictures, in decibels, and wait for it."""
     return decibels(float(squared_error(pred_linear, true_linear, keep)))
 
 
 def decibels(error: float) -> float:
-    """``-10 log10`` of a mean squared error: infinity for 0, NaN for NaN."""
+    """Convert a mean squared error to decibels, ``-10 log10``: infinity for 0, NaN for NaN."""
     return math.inf if error == 0 else -10 * math.log10(error)
 
 
 def squared_error(
     pred_linear: Tensor, true_linear: Tensor, keep: Keep = None, *, aligned: bool = False
 ) -> Tensor:
-    """Mean squared error of shown pictures.
+    """Compute the mean squared error of displayed pictures.
 
     Args:
         pred_linear, true_linear: [H, W, C] linear radiance.
-        keep: [H, W] bool or a selection, the pixels that count; None counts all.
-        aligned: first multiply each channel by the one factor that brings it closest to the true picture in linear
-            least squares, so that a wrong overall brightness or tint costs nothing.
+        keep: [H, W] bool or a selection, the pixels to score; None scores all.
+        aligned: first scale each channel to the true picture by linear least squares. This removes errors of
+            overall brightness and tint.
 
     Returns:
-        [], NaN where no pixel counts.
+        []; NaN without a pixel to score.
 
     Raises:
-        ValueError: shapes that do not fit.
+        ValueError: the shapes do not match.
     """
     _check_pair(pred_linear, true_linear)
     selection = _selected(keep, pred_linear)
@@ -89,25 +93,25 @@ def squared_error(
 
 
 def ssim(pred_linear: Tensor, true_linear: Tensor, keep: Keep = None, windows: Keep = None) -> Tensor:
-    """Structural similarity of shown pictures (Wang et al. 2004).
+    """Compute the structural similarity of displayed pictures (Wang et al. 2004).
 
-    Gaussian window of 11 x 11 pixels, sigma 1.5, K1 = 0.01, K2 = 0.03, population covariance, windows entirely inside
-    the picture, mean over windows and channels: what scikit-image computes with ``gaussian_weights=True, sigma=1.5,
-    use_sample_covariance=False, data_range=1``.
+    The window is Gaussian, 11 x 11 pixels, sigma 1.5. K1 is 0.01, K2 is 0.03. The covariance is that of the
+    population. The result is the mean over channels and over windows inside the picture. scikit-image
+    computes the same with ``gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=1``.
 
-    A pixel outside ``keep`` has no weight in any window (the weights of the others are normalized to one) and the
-    window around it does not count. Without such pixels this is the plain definition.
+    A pixel outside ``keep`` has no weight in any window, and the other weights are normalized to one. Windows
+    centered on such a pixel are left out.
 
     Args:
         pred_linear, true_linear: [H, W, C] linear radiance, H and W at least 11.
-        keep: [H, W] bool or a selection, the pixels that count; None counts all.
-        windows: ``window_centers`` of ``keep``, where they are known already.
+        keep: [H, W] bool or a selection, the pixels to score; None scores all.
+        windows: ``window_centers`` of ``keep`` if already computed.
 
     Returns:
-        [], at most 1; NaN where no window counts.
+        [], at most 1; NaN without a window.
 
     Raises:
-        ValueError: shapes that do not fit, or a picture smaller than the window.
+        ValueError: the shapes do not match, or the picture is smaller than the window.
     """
     _check_pair(pred_linear, true_linear)
     height, width = pred_linear.shape[:2]
@@ -127,20 +131,20 @@ def ssim(pred_linear: Tensor, true_linear: Tensor, keep: Keep = None, windows: K
 
 
 def window_centers(keep: Tensor) -> Tensor:
-    """Of a mask [H, W] of pixels, the centers of SSIM's windows: [H - 10, W - 10]."""
+    """Crop a mask [H, W] of pixels to the centers of SSIM windows [H - 10, W - 10]."""
     margin = SSIM_WINDOW // 2
     return keep[margin:-margin, margin:-margin]
 
 
 def normal_angles_deg(pred: Tensor, true: Tensor) -> Tensor:
-    """Angle between two directions, in degrees.
+    """Compute the angle between directions, in degrees.
 
     Args:
         pred, true: [..., 3] in the same axes, of any length.
 
     Returns:
-        [...] float64 in [0, 180]. A prediction without a direction (zero, or not finite) counts as 90 degrees
-        off, so that holes are not free. NaN where the ground truth has none.
+        [...] float64 in [0, 180]. A prediction without a direction (zero or not finite) counts as 90 degrees
+        off, so that holes have an error. NaN if the true vector has no direction.
     """
     if pred.shape != true.shape or pred.shape[-1] != 3:
         raise ValueError(
@@ -148,7 +152,7 @@ def normal_angles_deg(pred: Tensor, true: Tensor) -> Tensor:
         )
     a = torch.nan_to_num(pred.to(torch.float64), nan=0.0, posinf=0.0, neginf=0.0)
     b = true.to(a.device, torch.float64)
-    # atan2 of sine and cosine: accurate to the last digit near 0 and 180 degrees, where acos is not.
+    # atan2 is accurate near 0 and 180 degrees, in contrast to acos.
     sine = torch.linalg.vector_norm(torch.linalg.cross(a, b, dim=-1), dim=-1)
     angle = torch.rad2deg(torch.atan2(sine, (a * b).sum(-1)))
     angle = torch.where(has_direction(a), angle, 90.0)
@@ -156,36 +160,36 @@ def normal_angles_deg(pred: Tensor, true: Tensor) -> Tensor:
 
 
 def has_direction(vectors: Tensor) -> Tensor:
-    """Whether vectors [..., 3] are long enough to point anywhere, [...] bool."""
+    """Return [...] bool: True for vectors [..., 3] that are long enough to have a direction."""
     return torch.linalg.vector_norm(vectors.to(torch.float64), dim=-1) > SHORTEST
 
 
 def normal_mae_deg(pred: Tensor, true: Tensor, keep: Keep = None) -> Tensor:
-    """Mean angle between rendered and true normals in degrees (see ``normal_angles_deg``).
+    """Compute the mean angle between rendered and true normals in degrees, see ``normal_angles_deg``.
 
     Args:
         pred, true: [H, W, 3] in the same axes.
-        keep: [H, W] bool, the pixels that count, of which those without a true normal are left out, or a selection
-            without those; None counts all.
+        keep: pixels to score. A mask [H, W] bool may contain pixels without a true normal; they are left out.
+            A selection must not contain them. None scores all.
 
     Returns:
-        [] degrees; NaN where no pixel counts.
+        [] degrees; NaN without a pixel to score.
     """
     return _selected_angles(pred, true, keep).mean()
 
 
 def normal_within_11(pred: Tensor, true: Tensor, keep: Keep = None) -> Tensor:
-    """Share in [0, 1] of the pixels whose normal is under 11.25 degrees off, else as ``normal_mae_deg``."""
+    """Compute the share in [0, 1] of pixels with a normal error below 11.25 degrees, see ``normal_mae_deg``."""
     return (_selected_angles(pred, true, keep) < CLOSE_NORMAL_DEG).to(torch.float64).mean()
 
 
 def layer_error(contribution: Tensor, true_s0: Tensor, keep: Keep, *, aligned: bool = False) -> Tensor:
-    """``squared_error`` of what a layer adds to the final picture (S0/2) against the true S0 of its lobe [H, W, 3]."""
+    """Compute the ``squared_error`` of a layer's contribution to S0/2 against the true S0 of its lobe [H, W, 3]."""
     return squared_error(contribution, true_s0 / 2, keep, aligned=aligned)
 
 
 def reflective_mask(specular: Tensor, s0: Tensor, mask: Tensor) -> Tensor:
-    """The pixels that are mostly seen by their reflection.
+    """Return the mask of pixels that are dominated by reflection.
 
     Args:
         specular: [H, W, 3] true linear S0 of the specular lobe.
@@ -193,7 +197,8 @@ def reflective_mask(specular: Tensor, s0: Tensor, mask: Tensor) -> Tensor:
         mask: [H, W] bool, foreground.
 
     Returns:
-        [H, W] bool: foreground where the sum over channels of ``specular`` exceeds 0.3 times that of ``s0``.
+        [H, W] bool: foreground pixels whose sum over channels of ``specular`` exceeds 0.3 times that of
+        ``s0``.
     """
     return mask & (specular.to(torch.float64).sum(-1) > REFLECTIVE_SHARE * s0.to(torch.float64).sum(-1))
 
@@ -206,7 +211,7 @@ def _selected_angles(pred: Tensor, true: Tensor, keep: Keep) -> Tensor:
 
 
 def _selected(keep: Keep, picture: Tensor) -> Selection:
-    """The pixels of a picture [H, W, ...] that count, on its device."""
+    """Return the selection of pixels to score on the device of a picture [H, W, ...]."""
     size = picture.shape[:2]
     mask = torch.ones(size, dtype=torch.bool) if keep is None else keep
     selection = mask.mask if isinstance(mask, Selection) else mask
@@ -223,30 +228,30 @@ def _check_pair(pred: Tensor, true: Tensor) -> None:
 
 
 def _blur(channels: Tensor) -> Tensor:
-    """[C, H, W] averaged under the Gaussian window, where it lies inside the picture: [C, H - 10, W - 10]."""
+    """Average [C, H, W] under the Gaussian window, for windows inside the picture: [C, H - 10, W - 10]."""
     kernel = gaussian_window(channels.dtype, channels.device)
     rows = functional.conv2d(channels[:, None], kernel.view(1, 1, -1, 1))
     return functional.conv2d(rows, kernel.view(1, 1, 1, -1))[:, 0]
 
 
 LEAST_POLARIZED = 1e-3
-"""Where |S1| + |S2| is less than this share of S0, nothing was measured that a prediction could be compared with."""
+"""Ratio of |S1| + |S2| to S0 below which the Stokes error would compare noise."""
 HAZE_DEPTH = 0.8
-"""What hangs before a surface is nearer than this share of the surface's depth."""
+"""Depth in front of a surface that counts as haze, relative to the depth of the surface."""
 DEPTH_BEYOND = 1.25
-"""What is drawn behind a surface is farther than this many times the surface's depth."""
+"""Depth behind a surface that counts as an error, relative to the depth of the surface."""
 
 
 def stokes_error(pred: Tensor, true: Tensor, keep: Selection, photograph: Tensor) -> Tensor:
-    """Error of predicted S1 and S2 over that of predicting none: sum of |pred - true| over sum of |true|.
+    """Compute the error of predicted S1 and S2: sum of |pred - true| over sum of |true|.
 
     Args:
-        pred, true: [H, W, 6] linear S1, then S2, of each channel, on the scale where the picture is S0/2.
-        keep: the pixels that count. photograph: [H, W, 3] linear S0/2.
+        pred, true: [H, W, 6] linear S1, then S2, of each channel, on the scale of a picture S0/2.
+        keep: the pixels to score. photograph: [H, W, 3] linear S0/2.
 
     Returns:
-        [], 0 or more, 1 for no prediction; NaN where no pixel counts, or the sum of |true| is less than a thousandth
-        of that of S0, so that the quotient would be about noise.
+        [], 0 or more; 1 for a prediction of zero. NaN without a pixel to score, or if the sum of |true| is
+        below ``LEAST_POLARIZED`` times the sum of S0.
     """
     measured = keep.pick(true).abs().sum()
     enough = (measured > 0) & (measured >= LEAST_POLARIZED * 2 * keep.pick(photograph).sum())
@@ -255,37 +260,50 @@ def stokes_error(pred: Tensor, true: Tensor, keep: Selection, photograph: Tensor
 
 
 def depth_error_percent(pred: Tensor, true: Tensor, keep: Selection, extent: float) -> Tensor:
-    """Median of |pred - true| of depths [H, W], in percent of an extent; NaN where no pixel counts."""
+    """Compute the median of |pred - true| of depths [H, W], in percent of an extent; NaN without a pixel to score."""
     return 100 / extent * _median((keep.pick(pred) - keep.pick(true)).abs())
 
 
 def haze_share(in_front: Tensor, keep: Selection) -> Tensor:
-    """Share of the pixels of which at least half the weight [H, W] lies in front; NaN where no pixel counts."""
+    """Compute the share of pixels with at least half of their alpha [H, W] in front; NaN without a pixel to score."""
     return (keep.pick(in_front) >= 0.5).to(torch.float64).mean()
 
 
 def beyond_share(pred: Tensor, true: Tensor, keep: Selection) -> Tensor:
-    """Share of the pixels drawn from behind the true surface, of depths [H, W]; NaN where no pixel counts.
+    """Compute the share of pixels with a depth [H, W] behind the true surface; NaN without a pixel to score.
 
-    Those are the ones farther than ``DEPTH_BEYOND`` times the true depth, and those that nothing covers (depth 0).
+    A depth counts as behind above ``DEPTH_BEYOND`` times the true depth. An empty pixel (depth 0) counts,
+    too.
     """
     drawn = keep.pick(pred)
     beyond = (drawn > DEPTH_BEYOND * keep.pick(true)) | (drawn <= 0)
     return beyond.to(torch.float64).mean()
 
 
+def seen_share(pred: Tensor, seen: Selection, valid: Selection) -> Tensor:
+    """Return the share of the valid pixels whose content a training view shows; NaN without valid pixels.
+
+    Args:
+        pred: the rendered picture, for its device.
+        seen: valid pixels whose content a training view shows.
+        valid: the pixels that count.
+    """
+    count = pred.new_tensor(len(valid.places), dtype=torch.float64)
+    return len(seen.places) / torch.where(count > 0, count, torch.nan)
+
+
 def coverage_error(alpha: Tensor, mask: Tensor, keep: Selection) -> Tensor:
-    """Mean |alpha - mask| of [H, W] in [0, 1]; NaN where no pixel counts."""
+    """Compute the mean |alpha - mask| of [H, W] in [0, 1]; NaN without a pixel to score."""
     return (keep.pick(alpha) - keep.pick(mask)).abs().mean()
 
 
 def mean_alpha(alpha: Tensor, keep: Selection) -> Tensor:
-    """Mean alpha [H, W]; NaN where no pixel counts."""
+    """Compute the mean alpha of [H, W]; NaN without a pixel to score."""
     return keep.pick(alpha).mean()
 
 
 def _median(values: Tensor) -> Tensor:
-    """The median of [P], of an even number the mean of the middle two; NaN of none."""
+    """Compute the median of [P], with the mean of the middle two for an even count; NaN for an empty tensor."""
     count = len(values)
     if count == 0:
         return values.new_full((), torch.nan)

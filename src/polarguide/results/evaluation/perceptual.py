@@ -1,7 +1,7 @@
-"""Learned and perceptual distances of two pictures, where their packages and weights are installed: LPIPS and FLIP.
+"""Perceptual distances of two pictures, LPIPS and FLIP. Both are optional.
 
-LPIPS is over the layers of VGG-16 in plain PyTorch: Simonyan and Zisserman 2015 define the network, Zhang et al. 2018
-the distance and its weights of channels, "lin".
+LPIPS uses the layers of VGG-16 in plain PyTorch. Simonyan and Zisserman 2015 define the network. Zhang et al.
+2018 define the distance and its "lin" weights of the channels.
 """
 
 from __future__ import annotations
@@ -21,30 +21,30 @@ from polarguide.core.errors import PolarguideError, optional_import
 from polarguide.optics.color import shown
 
 FOLDER = "POLARGUIDE_LPIPS"
-"""Variable of the environment: a folder with the two files of weights."""
+"""Environment variable with the folder of the two files of weights."""
 NETWORK = "vgg16-397923af.pth"
-"""File of the network's convolutions, as torch's hub names it."""
+"""File of the network's convolutions in torch hub."""
 CHANNELS = "vgg.pth"
-"""File of the weights of channels."""
-HELP = "docs/reference/metrics.md, LPIPS, has the commands that add them"
+HELP = "see LPIPS in docs/reference/metrics.md for the commands that install them"
 _STAGES = ((0, 2), (5, 7), (10, 12, 14), (17, 19, 21), (24, 26, 28))
-"""Numbers of the convolutions between two halvings, as the file of the network counts its layers."""
+"""Indices of the convolutions between two poolings, in the numbering of the network's file."""
 _SHIFT = (-0.030, -0.088, -0.188)
 """Mean of ImageNet's colors, for values from -1 to 1."""
 _SCALE = (0.458, 0.448, 0.450)
 """Standard deviation of ImageNet's colors."""
 _LEAST_LENGTH = 1e-8
-"""Added to squared lengths of features, which then can be divided by."""
+"""Offset of squared feature lengths, against division by zero."""
 
 
 class Lpips:
-    """The distance.
+    """LPIPS distance.
 
     Args:
-        network: ``features.N.weight`` and ``features.N.bias`` of the convolutions. channels: ``linK.model.1.weight``.
+        network: ``features.N.weight`` and ``features.N.bias`` of the convolutions. channels:
+            ``linK.model.1.weight``.
 
     Raises:
-        KeyError, RuntimeError: a tensor is missing, or has another shape.
+        KeyError, RuntimeError: a tensor is missing or has another shape.
     """
 
     def __init__(self, network: Mapping[str, Tensor], channels: Mapping[str, Tensor]) -> None:
@@ -62,14 +62,14 @@ class Lpips:
             self._weights.append(channels[f"lin{number}.model.1.weight"].float().reshape(1, width, 1, 1))
 
     def to(self, device: torch.device) -> Lpips:
-        """The same, with its weights on a device."""
+        """Move the weights to a device and return self."""
         self._stages = [[(w.to(device), b.to(device)) for w, b in stage] for stage in self._stages]
         self._weights = [weights.to(device) for weights in self._weights]
         return self
 
     @torch.no_grad()
     def __call__(self, first: Tensor, second: Tensor) -> float:
-        """The distance of two pictures [H, W, 3] in [0, 1] as displayed, at least 32 pixels each way."""
+        """Compute the distance of two displayed pictures [H, W, 3] in [0, 1], at least 32 pixels per side."""
         shift, scale = (first.new_tensor(values).view(1, 3, 1, 1) for values in (_SHIFT, _SCALE))
         values = torch.stack((first, second)).movedim(-1, 1).float()
         values = (2 * values - 1 - shift) / scale
@@ -86,8 +86,10 @@ class Lpips:
 
 
 def places(name: str) -> list[Path]:
-    """Where a file of weights may be: in the folder that the environment names, else in torch's cache, and in
-    torchmetrics, which brings the weights of channels.
+    """Return the possible paths of a file of weights.
+
+    These are the folder in the environment variable if it is set; else torch's cache, and torchmetrics for
+    the weights of the channels.
     """
     if folder := os.environ.get(FOLDER):
         return [Path(folder) / name]
@@ -99,14 +101,14 @@ def places(name: str) -> list[Path]:
 
 
 def load_lpips() -> tuple[Lpips | None, str | None]:
-    """The distance, loaded once per process and place of its files: (distance, None), or (None, reason)."""
+    """Load the distance once per process and location of its files: (distance, None) or (None, reason)."""
     files = []
     for name in (NETWORK, CHANNELS):
-        there = [path for path in places(name) if path.is_file()]
-        if not there:
-            where = f"not in the folder that {FOLDER} names" if os.environ.get(FOLDER) else "missing"
+        file = next((path for path in places(name) if path.is_file()), None)
+        if file is None:
+            where = f"not in the folder {FOLDER}" if os.environ.get(FOLDER) else "missing"
             return None, f"not installed: its weights {name} are {where}; {HELP}"
-        files.append(there[0])
+        files.append(file)
     return _loaded(*files)
 
 
@@ -116,29 +118,29 @@ def _loaded(network: Path, channels: Path) -> tuple[Lpips | None, str | None]:
         return Lpips(
             *(torch.load(path, map_location="cpu", weights_only=True) for path in (network, channels))
         ), None
-    except Exception as error:  # a file that is cut short fails in many ways
-        first = str(error).strip().splitlines()[0][:200] if str(error).strip() else "no reason"
-        return None, f"damaged: {network.name} and {channels.name} are no weights of LPIPS ({first})"
+    except Exception as error:  # A truncated file fails in many ways.
+        first = (str(error).strip() or "no reason").splitlines()[0][:200]
+        return None, f"damaged: {network.name} and {channels.name} are not weights of LPIPS ({first})"
 
 
-# Five halvings: below this the last layer of the network has no pixel.
 MINIMUM_SIZE = 32
+"""Minimum picture side. The network halves it five times."""
 
 
 def lpips(
     pred_linear: Tensor, true_linear: Tensor, keep: Tensor | None = None
 ) -> tuple[float | None, str | None]:
-    """Learned perceptual distance of two shown pictures.
+    """Compute the learned perceptual distance of two displayed pictures.
 
-    The network reads whole pictures, so pixels outside ``keep`` are set to the true picture in both.
+    The network reads whole pictures. So pixels outside ``keep`` show the true picture in both.
 
     Args:
         pred_linear, true_linear: [H, W, 3] linear radiance.
-        keep: [H, W] bool, the pixels that count; None counts all.
+        keep: [H, W] bool, the pixels to score; None scores all.
 
     Returns:
-        (distance, None), the distance 0 for equal pictures and smaller for more alike ones; or (None, reason)
-        where the weights are not there or a picture is smaller than 32 pixels.
+        (distance, None) with the distance 0 for equal pictures; or (None, reason) if the weights are missing
+        or the picture is smaller than 32 pixels.
     """
     if min(pred_linear.shape[:2]) < MINIMUM_SIZE:
         return None, f"the picture is smaller than {MINIMUM_SIZE} x {MINIMUM_SIZE} pixels"
@@ -155,25 +157,25 @@ def lpips(
 
 
 PIXELS_PER_DEGREE = 67.0206
-"""Of the visual angle: a display of 3840 pixels, 0.7 m wide, seen from 0.7 m, as the authors report it."""
+"""Pixels per degree of visual angle: a display 0.7 m wide with 3840 pixels, at a distance of 0.7 m."""
 PACKAGE = "flip-evaluator"
 
 
 def flip(
     pred_linear: Tensor, true_linear: Tensor, keep: Tensor | None = None
 ) -> tuple[float | None, str | None]:
-    """Mean LDR-FLIP of two shown pictures (Andersson et al. 2020) at ``PIXELS_PER_DEGREE``.
+    """Compute the mean LDR-FLIP of two displayed pictures (Andersson et al. 2020) at ``PIXELS_PER_DEGREE``.
 
-    The eye's filters reach beyond a pixel, so pixels outside ``keep`` are black in both, and the mean is taken over the
-    others.
+    FLIP's filters extend over several pixels. So pixels outside ``keep`` are black in both pictures, and the
+    mean excludes them.
 
     Args:
         pred_linear, true_linear: [H, W, 3] linear radiance.
-        keep: [H, W] bool, the pixels that count; None counts all.
+        keep: [H, W] bool, the pixels to score; None scores all.
 
     Returns:
-        (value, None), the value from 0 for equal pictures to 1; or (None, reason) where the package is not installed or
-        no pixel counts.
+        (value, None) with a value in [0, 1], 0 for equal pictures; or (None, reason) if the package is
+        missing or there is no pixel to score.
     """
     package, reason = load_package()
     if package is None:
@@ -182,7 +184,7 @@ def flip(
     pred = pred_linear.detach().cpu().to(true.dtype)
     counts = torch.ones(true.shape[:2], dtype=torch.bool) if keep is None else keep.cpu()
     if not counts.any():
-        return None, "no pixel counts"
+        return None, "no pixel to score"
     encoded = [
         torch.where(counts[..., None], shown(picture), 0.0).float().contiguous().numpy()
         for picture in (true, pred)
@@ -195,7 +197,7 @@ def flip(
 
 @lru_cache(maxsize=1)
 def load_package() -> tuple[Any, str | None]:
-    """The package ``flip_evaluator``, loaded once per process: (package, None), or (None, reason)."""
+    """Load the package ``flip_evaluator`` once per process: (package, None) or (None, reason)."""
     try:
         return optional_import("flip_evaluator", "FLIP"), None
     except PolarguideError:

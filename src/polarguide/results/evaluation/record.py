@@ -1,4 +1,4 @@
-"""A run's numbers in a file, ``metrics.json``, and the code that they come from: a digest and a commit."""
+"""The scores of a run in ``metrics.json``, and the digest and commit of the code that computed them."""
 
 from __future__ import annotations
 
@@ -31,48 +31,51 @@ from polarguide.results.evaluation.table import (
 
 PACKAGE = Path(__file__).parents[2]
 COMMIT = "_commit.txt"
-"""Beside the package's modules in a wheel: the commit it was built from, empty where that was not known."""
+"""File in an installed package with the commit of its build. It is empty if the commit is unknown."""
 DIGITS = 16
 NOT_TRAINING = ("results", "inspection", "viewer", "api", "cli", "__main__.py")
-"""Parts of the package that no training can reach."""
+"""Parts of the package that training never imports."""
 BENCH = "polarguide_bench"
-"""The neighboring package with the recipes of comparisons."""
+"""Neighboring package with the recipes of comparisons."""
 BENCH_TRAINING = ("recipes.py", "gnerp")
-"""Parts of that package that a training can reach."""
+"""Parts of the bench that training imports."""
 
 
 @lru_cache
 def code_digest(package: Path = PACKAGE, *, training: bool = False) -> str:
-    """Sixteen hexadecimal digits that change with the code of the package and with the compiled library.
+    """Hash the code of the package and the compiled library to 16 hexadecimal digits.
 
-    Comments and docstrings do not count, so that editing them invalidates no result.
+    Comments and docstrings do not change the digest.
 
     Args:
-        package: folder of the package; the bench is beside it.
-        training: only the code that a training can reach, so that a change of scoring repeats no training.
+        package: folder of the package. The bench is its sibling.
+        training: hash only code that training imports. So a change of scoring does not invalidate a training.
     """
     compiled = [path for path in package.glob("_native.*") if path.suffix != ".pyi"]
     bench = package.with_name(BENCH)
-    own = [*package.rglob("*.py")]
+    sources = [*package.rglob("*.py")]
     neighbors = [*bench.rglob("*.py")]
     if training:
-        own = [path for path in own if path.relative_to(package).parts[0] not in NOT_TRAINING]
+        sources = [path for path in sources if path.relative_to(package).parts[0] not in NOT_TRAINING]
         neighbors = [path for path in neighbors if path.relative_to(bench).parts[0] in BENCH_TRAINING]
-    return _digest(package.parent, [*own, *neighbors, *compiled])
+    return _digest(package.parent, [*sources, *neighbors, *compiled])
 
 
 def _digest(folder: Path, files: Sequence[Path]) -> str:
-    whole = hashlib.sha256()
+    digest = hashlib.sha256()
     for path in sorted(files):
         data = path.read_bytes()
         content = _code_hash(data) if path.suffix == ".py" else hashlib.sha256(data).hexdigest()
-        whole.update(f"{path.relative_to(folder).as_posix()} {content}\n".encode())
-    return whole.hexdigest()[:DIGITS]
+        digest.update(f"{path.relative_to(folder).as_posix()} {content}\n".encode())
+    return digest.hexdigest()[:DIGITS]
 
 
 @cache
 def _code_hash(source: bytes) -> str:
-    """Of the syntax tree without docstrings; kept, since all files take seconds, and two digests share most of them."""
+    """Hash the syntax tree of a source without docstrings.
+
+    The cache saves seconds, because two digests share most files.
+    """
     tree = ast.parse(source)
     documented = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
     for node in ast.walk(tree):
@@ -82,13 +85,15 @@ def _code_hash(source: bytes) -> str:
 
 
 def commit(package: Path = PACKAGE) -> str | None:
-    """The commit that the program was built from, or runs from if it was not built; never an outer repository's.
+    """Return the commit of the build, or of the repository that contains the running source.
+
+    An outer repository that contains the project in a subfolder does not count.
 
     Args:
         package: folder of the package.
 
     Returns:
-        The hash; None where it is not known.
+        The hash; None if it is unknown.
     """
     stamp = package / COMMIT
     if stamp.exists():
@@ -96,18 +101,21 @@ def commit(package: Path = PACKAGE) -> str | None:
     command = ["git", "-C", str(package), "rev-parse", "--show-toplevel", "HEAD"]
     try:
         git = subprocess.run(command, capture_output=True, text=True, check=True)
-    except (FileNotFoundError, subprocess.CalledProcessError):  # no git on this machine, or no repository
+    except (
+        FileNotFoundError,
+        subprocess.CalledProcessError,
+    ):  # Git is not installed, or there is no repository.
         return None
     top, head = git.stdout.splitlines()
     return head if Path(top, "src", package.name).resolve() == package.resolve() else None
 
 
 METRICS_FILE = "metrics.json"
-_WRITE_AGAIN = "Score the run again with this version: polarguide eval."
+_REMEDY = "Score the run again with this version: polarguide eval."
 
 
 class Provenance(TypedDict):
-    """Facts that are needed to repeat a run. Other fields may stand beside it."""
+    """Facts for the repetition of a run. Additional fields are allowed."""
 
     recipe: str
     seed: int
@@ -122,13 +130,13 @@ _Decibels = Annotated[float, msgspec.Meta(le=HIGHEST_PSNR)] | None
 
 
 def _fields(metrics: tuple[Metric, ...], *reasons: str) -> list[Any]:
-    """Fields of a record: the metrics, and reasons of those that may be null for another one than missing truth."""
+    """Return the fields of a record: metrics, and reasons for null values other than missing ground truth."""
     values: list[Any] = []
     for metric in metrics:
         kind = _Decibels if metric.unit == "dB" else float | None
-        # A record of before its package was installed has no value of a plugged metric.
+        # A record may be older than the installation of the metric's package.
         values.append((metric.key, kind, None) if metric in PLUGGED else (metric.key, kind))
-    values.sort(key=len)  # what has a default comes last
+    values.sort(key=len)  # Fields with a default come last.
     return [*values, *((f"{key}_reason", str | None, None) for key in reasons)]
 
 
@@ -147,9 +155,8 @@ _OBJECT = msgspec.defstruct(
     ],
     kw_only=True,
 )
-"""Errors over the pixels of an object, or of all objects of a class of material, in all test views."""
+"""Errors over the pixels of an object or a class of material in all test views."""
 _PARTS = GenericAlias(dict, (str, _OBJECT))
-"""Such errors by name."""
 _VIEW = msgspec.defstruct("View", _fields(VIEW_METRICS, *_VIEW_REASONS))
 _RUN = msgspec.defstruct(
     "Run",
@@ -162,6 +169,7 @@ _RUN = msgspec.defstruct(
     ],
     kw_only=True,
 )
+"""Record in ``metrics.json``."""
 
 
 def write_metrics(
@@ -173,20 +181,20 @@ def write_metrics(
     objects: Mapping[str, Any] | None = None,
     materials: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """Write ``metrics.json`` in one step: a reader sees the old file or the whole new one.
+    """Write ``metrics.json`` atomically.
 
-    Top level: the means of ``summarize``, the keys of ``run``, ``views``, ``objects``, ``materials`` and
-    ``provenance``. NaN becomes null.
+    The top level holds the means of ``summarize``, the keys of ``run``, ``views``, ``objects``, ``materials``
+    and ``provenance``. NaN becomes null.
 
     Args:
         path: the file; its folder must exist.
-        views: the scores by view name, at least one.
-        run: values of ``RUN_METRICS`` by key, null where left out, and the reasons of what is null, as ``fps_reason``.
-        provenance: the keys of ``Provenance``, and others as you like.
-        objects, materials: errors by object and by class of material, as of ``ErrorsByObject.records``.
+        views: scores by view name, at least one view.
+        run: values of ``RUN_METRICS`` by key (null if missing) and reasons for null, such as ``fps_reason``.
+        provenance: the keys of ``Provenance``; other keys are allowed.
+        objects, materials: errors by object and by class of material, see ``ErrorsByObject.records``.
 
     Returns:
-        What was written.
+        The record.
 
     Raises:
         PolarguideError: the record does not pass ``validate_metrics``.
@@ -209,50 +217,49 @@ def write_metrics(
 
 
 def read_metrics(run: Path) -> dict[str, Any]:
-    """The scores in a run folder, as ``write_metrics`` wrote them.
+    """Read the scores in a run folder.
 
     Raises:
-        PolarguideError: the run has not been scored, or the file is not such a record.
+        PolarguideError: the run has no scores, or the file is not a valid record.
     """
     path = run / METRICS_FILE
     if not path.exists():
         raise PolarguideError(
             path, expected="the scores of a run", found="none", remedy="Run polarguide eval."
         )
-    record = read_record(path, dict[str, Any], remedy=_WRITE_AGAIN)
+    record = read_record(path, dict[str, Any], remedy=_REMEDY)
     validate_metrics(record, path)
     return record
 
 
 def validate_metrics(record: Any, where: str | Path = METRICS_FILE) -> None:
-    """Check a record against the schema of ``metrics.json``.
+    """Validate a record against the schema of ``metrics.json``.
 
     Args:
         record: the parsed file.
-        where: what an error message calls it.
+        where: name of the record in an error.
 
     Raises:
-        PolarguideError: naming the first key at fault, what was expected there, and what was found.
+        PolarguideError: the record is invalid. The error names the first invalid key.
     """
-    decode(record, _RUN, where, remedy=_WRITE_AGAIN)
+    decode(record, _RUN, where, remedy=_REMEDY)
     _check_reason(record, where)
     for name, scores in record["views"].items():
-        decode(scores, _VIEW, f"{where}, view {name}", remedy=_WRITE_AGAIN)
+        decode(scores, _VIEW, f"{where}, view {name}", remedy=_REMEDY)
         _check_reason(scores, f"{where}, view {name}")
 
 
 def _check_reason(scores: Mapping[str, Any], where: object) -> None:
-    """Refuse an absent LPIPS without a reason."""
     reason = scores.get("lpips_reason")
     if scores["lpips"] is None and not reason:
         raise PolarguideError(
             f"{where} (lpips_reason)",
             expected="a reason, because lpips is null",
             found=shortened(reason),
-            remedy=_WRITE_AGAIN,
+            remedy=_REMEDY,
         )
 
 
 def _finite(value: Any) -> Any:
-    """A value as JSON can hold it."""
+    """Replace a number that JSON cannot represent by None."""
     return None if isinstance(value, float) and not math.isfinite(value) else value

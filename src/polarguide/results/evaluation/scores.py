@@ -18,14 +18,14 @@ from polarguide.results.evaluation.target import ViewTarget
 from polarguide.shading.result import RenderResult
 
 HALF = 0.5
-"""Share of metals from which on a pixel counts as one."""
+"""Metalness above which a pixel counts as metal."""
 
 
 class ErrorMap(NamedTuple):
-    """An error of every pixel; over any pixels the metric is the sum of ``error`` over that of ``weight``.
+    """Error of each pixel. The metric of a region is the sum of ``error`` over the sum of ``weight``.
 
     Attributes:
-        error: [H, W], 0 where it does not count. weight: [H, W], 0 where it does not count.
+        error: [H, W], 0 outside the mask. weight: [H, W], 0 outside the mask.
     """
 
     error: Tensor
@@ -33,10 +33,10 @@ class ErrorMap(NamedTuple):
 
 
 def error_maps(target: ViewTarget, layers: Layers) -> dict[str, ErrorMap]:
-    """The maps of ``OBJECT_METRICS`` as far as layers and truth are there, float64.
+    """Return the error maps of ``OBJECT_METRICS`` for which layers and ground truth exist, float64.
 
-    Squared error of shown pictures (mean over channels) for PSNRs; degrees; sum over channels of |S1 error| + |S2
-    error|, whose weight is that of |S1| + |S2|.
+    PSNR: squared error of displayed pictures, mean over channels. Normals: degrees. Stokes error: |S1 error|
+    + |S2 error|, sum over channels, with |S1| + |S2| as weight.
     """
     maps = {"psnr": _squared(layers["final"], target.photograph, target.valid)}
     for name in ("specular", "diffuse"):
@@ -64,12 +64,12 @@ def _squared(pred: Tensor | None, true: Tensor | None, keep: Selection | None) -
 
 
 class ErrorsByObject:
-    """Sums of errors over the pixels of each object, and of each class of material, in all views.
+    """Sums of errors over the pixels of each object and of each class of material in all views.
 
-    They stay on the views' device until they are read.
+    The sums stay on the device of the views until ``records`` reads them.
 
     Args:
-        objects: in the order of ``ViewTarget.owner``.
+        objects: the objects in the order of ``ViewTarget.owner``.
     """
 
     def __init__(self, objects: Sequence[SceneObject]) -> None:
@@ -79,10 +79,10 @@ class ErrorsByObject:
             [[item.material.kind == kind for item in objects] for kind in self._kinds], dtype=torch.float64
         ).reshape(len(self._kinds), len(self._objects))
         self._sums: Tensor | None = None
-        self._tells_metals = False
+        self._has_metals = False
 
     def add(self, target: ViewTarget, layers: Layers) -> None:
-        """Add a view; one whose pixels' objects are not known adds nothing."""
+        """Add the errors of a view. A view without a map of objects adds no error."""
         owner = target.owner
         if owner is None:
             return
@@ -92,7 +92,7 @@ class ErrorsByObject:
         lit = nothing if target.polarized is None else 2 * target.photograph.sum(-1) * target.polarized.mask
         columns = [values for key in OBJECT_METRICS for values in maps.get(key, (nothing, nothing))]
         metalness = layers.get("metalness")
-        self._tells_metals = metalness is not None
+        self._has_metals = metalness is not None
         metal = nothing if metalness is None else (metalness > HALF).to(torch.float64)
         columns += [metal, lit, counts.to(torch.float64)]
         table = torch.stack(columns, dim=-1).flatten(0, 1) * counts.flatten()[:, None]
@@ -104,10 +104,13 @@ class ErrorsByObject:
         self._sums = sums if self._sums is None else self._sums + sums
 
     def records(self) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Errors by the object's name, and by class of material, as ``metrics.json`` has them; waits for the device."""
+        """Return the errors by object name and by class of material, as in ``metrics.json``.
+
+        This waits for the device.
+        """
         if self._sums is None:
             return {}, {}
-        rows = [_record(row, metals=self._tells_metals) for row in self._sums.cpu().tolist()]
+        rows = [_record(row, metals=self._has_metals) for row in self._sums.cpu().tolist()]
         count = len(self._objects)
         by_object = {
             item.name: {"material": item.material.kind, **row}
@@ -130,17 +133,17 @@ def _record(sums: Sequence[float], *, metals: bool) -> dict[str, Any]:
     return record
 
 
-_NO_LAYERS = "the recipe has no specular and diffuse layers to predict it from"
-_UNDETERMINED = "the pictures of the view do not determine a Stokes vector"
-_NO_POLARIZATION = "hardly any polarization was measured where it counts"
+_NO_LAYERS = "the recipe has no specular and diffuse layers for a prediction"
+_UNDETERMINED = "the pictures of the view do not determine the Stokes vectors"
+_NO_POLARIZATION = "the measured polarization of the scored pixels is negligible"
 
 ViewScores = dict[str, float | str | None]
-"""The scores of one view by key. None where one is not defined: no ground truth, no such layer, no pixel that counts.
+"""Scores of one view by key. None means undefined: no ground truth, no such layer, or no pixel to score.
 
-``lpips_reason`` says why ``lpips`` is None, ``flip_reason`` why ``flip`` is, ``stokes_error_reason`` why
-``stokes_error`` is. ``nonfinite_pixels`` is
-there when the rendered layers held NaN or infinity, and counts the pixels; they were scored as black, and their normals
-as 90 degrees off.
+``lpips_reason``, ``flip_reason`` and ``stokes_error_reason`` explain a missing ``lpips``, ``flip`` and
+``stokes_error``.
+``nonfinite_pixels`` counts pixels with NaN or infinity in a rendered layer, if any. They are scored as black,
+and their normals as 90 degrees off.
 """
 
 
@@ -152,43 +155,46 @@ def score_view(
     in_front: Tensor | None = None,
     by_object: ErrorsByObject | None = None,
 ) -> ViewScores:
-    """Score one rendered view, on the device where it was rendered, which is waited for once.
+    """Score one rendered view on the device of its rendering.
 
-    (LPIPS, where its weights are at hand, waits by itself. FLIP is computed on the CPU.)
+    The function waits for that device once. LPIPS waits a second time. FLIP is computed on the CPU.
 
     Args:
-        target: what it is compared with, on the same device.
-        rendered: the rendering; layers that it does not have are not scored.
-        stokes: [3, H, W, 3] predicted Stokes vectors on the scale where the picture is S0/2; None: no prediction.
-        in_front: [H, W] share of the weight before ``HAZE_DEPTH`` times the true depth; None: not measured.
-        by_object: gets the view's errors added.
+        target: the ground truth of the view, on the same device.
+        rendered: the rendering. Missing layers are not scored.
+        stokes: [3, H, W, 3] predicted Stokes vectors on the scale of a picture S0/2; None without a
+            prediction.
+        in_front: [H, W] share of the alpha in front of ``HAZE_DEPTH`` times the true depth; None skips haze.
+        by_object: receives the errors of the view.
 
     Returns:
-        Every per-view key. PSNRs are at most ``HIGHEST_PSNR``.
+        All keys of a view. PSNRs are at most ``HIGHEST_PSNR``.
 
     Raises:
-        ValueError: shapes that do not fit.
+        ValueError: the shapes do not match.
     """
     names = ("final", "normal", "specular", "diffuse", "depth", "alpha", "metalness")
-    layers = {name: _plain(rendered.layers.get(name)) for name in names}
-    layers["polarization"] = None if stokes is None else _plain(stokes[1:].movedim(0, 2).flatten(2))
-    layers["in_front"] = _plain(in_front)
+    layers = {name: _detached(rendered.layers.get(name)) for name in names}
+    layers["polarization"] = None if stokes is None else _detached(stokes[1:].movedim(0, 2).flatten(2))
+    layers["in_front"] = _detached(in_front)
     broken = torch.zeros_like(target.valid.mask)
     for name, layer in layers.items():
         if layer is not None:
-            lost = ~(layer.isfinite() if layer.ndim == 2 else layer.isfinite().all(-1))
-            broken |= lost
-            layers[name] = torch.where(lost if layer.ndim == 2 else lost[..., None], 0.0, layer)
+            nonfinite = ~(layer.isfinite() if layer.ndim == 2 else layer.isfinite().all(-1))
+            broken |= nonfinite
+            layers[name] = torch.where(nonfinite if layer.ndim == 2 else nonfinite[..., None], 0.0, layer)
     final = layers["final"]
     assert final is not None
     distance, reason = lpips(final, target.photograph, target.valid.mask)
-    flipped, flip_reason = flip(final, target.photograph, target.valid.mask)
+    flip_score, flip_reason = flip(final, target.photograph, target.valid.mask)
     if by_object is not None:
         by_object.add(target, layers)
     measures = {m.key: m.measure(target, layers) for m in VIEW_METRICS if m.measure is not None}
     measured = {key: value.to(torch.float64) for key, value in measures.items() if value is not None}
-    # The only place where scoring waits for the device.
-    lost_pixels, *values = torch.stack([broken.sum().to(torch.float64), *measured.values()]).cpu().tolist()
+    # Scoring waits for the device only here.
+    nonfinite_pixels, *values = (
+        torch.stack([broken.sum().to(torch.float64), *measured.values()]).cpu().tolist()
+    )
     numbers = dict(zip(measured, values, strict=True))
     scores: ViewScores = {}
     for metric in VIEW_METRICS:
@@ -196,27 +202,27 @@ def score_view(
         if metric.unit == "dB":
             value = min(decibels(value), HIGHEST_PSNR)
         scores[metric.key] = _number(value)
-    scores |= {"lpips": distance, "lpips_reason": reason, "flip": flipped}
+    scores |= {"lpips": distance, "lpips_reason": reason, "flip": flip_score}
     if flip_reason is not None:
         scores["flip_reason"] = flip_reason
     if scores["stokes_error"] is None:
-        unmeasured = _NO_POLARIZATION if target.polarization is not None else _UNDETERMINED
-        scores["stokes_error_reason"] = _NO_LAYERS if stokes is None else unmeasured
-    if lost_pixels:
-        scores["nonfinite_pixels"] = int(lost_pixels)
+        measurement_reason = _NO_POLARIZATION if target.polarization is not None else _UNDETERMINED
+        scores["stokes_error_reason"] = _NO_LAYERS if stokes is None else measurement_reason
+    if nonfinite_pixels:
+        scores["nonfinite_pixels"] = int(nonfinite_pixels)
     return scores
 
 
 def summarize(per_view: Mapping[str, ViewScores]) -> dict[str, float | str | None]:
-    """Plain means over views (a mean of PSNRs, not a PSNR of means).
+    """Return the mean of each score over the views (the mean of PSNRs, not the PSNR of the mean error).
 
     Args:
-        per_view: the scores by view name.
+        per_view: scores by view name.
 
     Returns:
-        The keys of ``VIEW_METRICS``, each the mean over the views where it is a number, None where it is in no
-        view; ``lpips_reason``, the reason of the first view without LPIPS, else None; ``flip_reason`` and
-        ``stokes_error_reason`` where no view has such a value.
+        The keys of ``VIEW_METRICS``: the mean over the views with a value, or None if no view has one.
+            ``lpips_reason`` is the reason of the first view without LPIPS. ``flip_reason`` and
+            ``stokes_error_reason`` are present if no view has a value.
     """
     means: dict[str, float | str | None] = {}
     for metric in VIEW_METRICS:
@@ -231,10 +237,10 @@ def summarize(per_view: Mapping[str, ViewScores]) -> dict[str, float | str | Non
     return means
 
 
-def _plain(layer: Tensor | None) -> Tensor | None:
+def _detached(layer: Tensor | None) -> Tensor | None:
     return None if layer is None else layer.detach().to(torch.float64)
 
 
 def _number(value: object) -> float | None:
-    """None for what is not a finite number."""
+    """Return a finite number as float, and None for any other value."""
     return float(value) if isinstance(value, (int, float)) and math.isfinite(value) else None

@@ -1,6 +1,6 @@
-"""The one table of metrics: how each is measured on a view, and how scores, console, tables and report show it.
+"""Table of all metrics: computation on a view and display in scores, console, tables and report.
 
-A new metric is a row here, beside the function in ``metrics.py`` that it calls; or comes with an installed package.
+A new metric needs a row here and a function in ``metrics.py``, or an installed package.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from polarguide.results.evaluation.metrics import (
     mean_alpha,
     normal_mae_deg,
     normal_within_11,
+    seen_share,
     squared_error,
     ssim,
     stokes_error,
@@ -28,15 +29,16 @@ from polarguide.results.evaluation.metrics import (
 from polarguide.results.evaluation.target import ViewTarget
 
 HIGHEST_PSNR = 100.0
-"""What a PSNR above it, and the infinite one of equal pictures, is recorded as: JSON has no infinity."""
+"""Upper bound of a recorded PSNR. JSON has no infinity for equal pictures."""
 MESH_LABEL = "mesh F-score 1 %"
 
 
-def _compared(compare: Callable[..., Tensor], layer: str, *known: str) -> Measure:
-    """A measure of a rendered layer by what the target knows, such as its true values and one of its regions.
+def _comparison(compare: Callable[..., Tensor], layer: str, *known: str) -> Measure:
+    """Return a measure that compares a rendered layer with attributes of the target.
 
     Args:
-        compare: takes the layer, and the attributes of the target that ``known`` names.
+        compare: takes the layer and the attributes. layer: name of the layer.
+        known: names of attributes of the target, such as the true layer and a region.
     """
 
     def measure(target: ViewTarget, layers: Layers) -> Tensor | None:
@@ -47,18 +49,35 @@ def _compared(compare: Callable[..., Tensor], layer: str, *known: str) -> Measur
 
 
 def _layer(name: str, *, aligned: bool = False, region: str = "foreground") -> Measure:
-    """The squared error of a layer against its true lobe on the foreground, or another region."""
-    return _compared(partial(layer_error, aligned=aligned), name, name, region)
+    """Return the measure of the squared error of a layer against its true lobe in a region."""
+    return _comparison(partial(layer_error, aligned=aligned), name, name, region)
 
 
 def _mesh(key: str, label: str, *, shown: Literal["tables", "files"] = "files") -> Metric:
-    """A share of the mesh, or of what it should be."""
+    """Return a metric of the mesh in percent."""
     return Metric(key, label, "%", 1, "higher", of="run", shown=shown, factor=100.0)
 
 
-OURS: tuple[Metric, ...] = (
+BUILT_IN_METRICS: tuple[Metric, ...] = (
     Metric(
-        "psnr", "PSNR", "dB", 2, "higher", measure=_compared(squared_error, "final", "photograph", "valid")
+        "psnr", "PSNR", "dB", 2, "higher", measure=_comparison(squared_error, "final", "photograph", "valid")
+    ),
+    Metric(
+        "psnr_seen",
+        "PSNR seen",
+        "dB",
+        2,
+        "higher",
+        measure=_comparison(squared_error, "final", "photograph", "seen"),
+    ),
+    Metric(
+        "seen_share",
+        "seen pixels",
+        "%",
+        1,
+        None,
+        measure=_comparison(seen_share, "final", "seen", "valid"),
+        factor=100.0,
     ),
     Metric(
         "psnr_foreground",
@@ -66,7 +85,7 @@ OURS: tuple[Metric, ...] = (
         "dB",
         2,
         "higher",
-        measure=_compared(squared_error, "final", "photograph", "foreground"),
+        measure=_comparison(squared_error, "final", "photograph", "foreground"),
     ),
     Metric(
         "psnr_reflective",
@@ -74,10 +93,18 @@ OURS: tuple[Metric, ...] = (
         "dB",
         2,
         "higher",
-        measure=_compared(squared_error, "final", "photograph", "reflective"),
+        measure=_comparison(squared_error, "final", "photograph", "reflective"),
     ),
     Metric(
-        "ssim", "SSIM", "", 3, "higher", measure=_compared(ssim, "final", "photograph", "valid", "windows")
+        "ssim", "SSIM", "", 3, "higher", measure=_comparison(ssim, "final", "photograph", "valid", "windows")
+    ),
+    Metric(
+        "ssim_seen",
+        "SSIM seen",
+        "",
+        3,
+        "higher",
+        measure=_comparison(ssim, "final", "photograph", "seen", "seen_windows"),
     ),
     Metric("lpips", "LPIPS", "", 3, "lower"),
     Metric("flip", "FLIP", "", 3, "lower"),
@@ -87,7 +114,7 @@ OURS: tuple[Metric, ...] = (
         "deg",
         1,
         "lower",
-        measure=_compared(normal_mae_deg, "normal", "normal", "surface"),
+        measure=_comparison(normal_mae_deg, "normal", "normal", "surface"),
     ),
     Metric(
         "normal_within_11",
@@ -95,7 +122,7 @@ OURS: tuple[Metric, ...] = (
         "%",
         1,
         "higher",
-        measure=_compared(normal_within_11, "normal", "normal", "surface"),
+        measure=_comparison(normal_within_11, "normal", "normal", "surface"),
         factor=100.0,
     ),
     Metric("specular_psnr", "specular PSNR", "dB", 2, "higher", measure=_layer("specular")),
@@ -142,7 +169,15 @@ OURS: tuple[Metric, ...] = (
         "",
         3,
         "lower",
-        measure=_compared(stokes_error, "polarization", "polarization", "polarized", "photograph"),
+        measure=_comparison(stokes_error, "polarization", "polarization", "polarized", "photograph"),
+    ),
+    Metric(
+        "stokes_error_seen",
+        "Stokes error seen",
+        "",
+        3,
+        "lower",
+        measure=_comparison(stokes_error, "polarization", "polarization", "seen_polarized", "photograph"),
     ),
     Metric(
         "depth_error_median_percent",
@@ -150,7 +185,7 @@ OURS: tuple[Metric, ...] = (
         "%",
         2,
         "lower",
-        measure=_compared(depth_error_percent, "depth", "depth", "near", "extent"),
+        measure=_comparison(depth_error_percent, "depth", "depth", "near", "extent"),
     ),
     Metric(
         "haze",
@@ -158,7 +193,7 @@ OURS: tuple[Metric, ...] = (
         "%",
         2,
         "lower",
-        measure=_compared(haze_share, "in_front", "smooth"),
+        measure=_comparison(haze_share, "in_front", "smooth"),
         shown="files",
         factor=100.0,
     ),
@@ -168,7 +203,7 @@ OURS: tuple[Metric, ...] = (
         "%",
         2,
         "lower",
-        measure=_compared(beyond_share, "depth", "depth", "smooth"),
+        measure=_comparison(beyond_share, "depth", "depth", "smooth"),
         shown="files",
         factor=100.0,
     ),
@@ -178,7 +213,7 @@ OURS: tuple[Metric, ...] = (
         "%",
         2,
         "lower",
-        measure=_compared(coverage_error, "alpha", "mask", "valid"),
+        measure=_comparison(coverage_error, "alpha", "mask", "valid"),
         shown="files",
         factor=100.0,
     ),
@@ -188,7 +223,7 @@ OURS: tuple[Metric, ...] = (
         "%",
         2,
         "lower",
-        measure=_compared(mean_alpha, "alpha", "beyond"),
+        measure=_comparison(mean_alpha, "alpha", "beyond"),
         shown="files",
         factor=100.0,
     ),
@@ -205,36 +240,38 @@ OURS: tuple[Metric, ...] = (
     Metric("steps", "steps", "", 0, None, of="run", shown="record"),
     Metric("peak_memory_mib", "peak memory", "MiB", 0, "lower", of="run", shown="record"),
 )
-PLUGGED = plugged_metrics({metric.key for metric in OURS})
+"""Metrics of this package."""
+PLUGGED = plugged_metrics({metric.key for metric in BUILT_IN_METRICS})
 """Metrics of installed packages."""
-METRICS = (*OURS, *PLUGGED)
-"""All of them, in the order in which they are shown."""
+METRICS = (*BUILT_IN_METRICS, *PLUGGED)
+"""All metrics in the order of display."""
 OBJECT_METRICS = ("psnr", "normal_mae_deg", "specular_psnr", "diffuse_psnr", "stokes_error")
 """Keys of the metrics that are recorded by object and by material."""
 VIEW_METRICS = tuple(metric for metric in METRICS if metric.of == "view")
-"""Those of one view, which are averaged over views."""
+"""Metrics of a view. A run records their means over views."""
 RUN_METRICS = tuple(metric for metric in METRICS if metric.of == "run")
-"""Those that belong to a run. Each may be null."""
+"""Metrics of a run. Each may be null."""
 COLUMNS = tuple(metric for metric in METRICS if metric.shown != "record")
-"""Those that comparisons collect."""
+"""Metrics that comparisons collect."""
 METAL_SHARE = Metric("metal_share", "taken for metal", "%", 1, None, factor=100.0)
-"""Share of a part's pixels that are more than half metal, of recipes that know metals."""
+"""Share of the pixels of an object with a metalness above one half, for recipes with metals."""
 PART_METRICS = (*(metric for metric in COLUMNS if metric.of == "view"), METAL_SHARE)
-"""Those that an object or a class of material may have."""
+"""Metrics of an object or a class of material."""
 
 
 def shown_metrics(record: Mapping[str, Any], *, scores_only: bool = False) -> list[tuple[str, str]]:
-    """The metrics of a run as people read them.
+    """Return the labels and values of the metrics of a run in the order of the table.
+
+    A metric without a value shows "n/a" and a short reason; ``explained`` returns the long reasons. A metric
+    without a value and without a reason is left out, see ``absent_metrics``. The PSNR of the worst view
+    follows the mean PSNR.
 
     Args:
-        record: record of a run, as ``metrics.json`` has it.
-        scores_only: leave out what belongs to the run alone (times, counts) and what has no value.
+        record: record of a run from ``metrics.json``.
+        scores_only: leave out metrics of the run (times, counts) and metrics without a value.
 
     Returns:
-        Labels and values with their units, in the order of the table; "n/a" and why for a metric without a value, in
-        a few words: ``explained`` has the rest. One that has no reason recorded, for want of ground truth or of a
-        layer, is left out: see ``absent_metrics``.
-        Below the PSNR stands that of the worst view, which a mean hides.
+        Pairs of label and value with unit.
     """
     lines = []
     for metric in METRICS:
@@ -251,7 +288,7 @@ def shown_metrics(record: Mapping[str, Any], *, scores_only: bool = False) -> li
 
 
 def explained(record: Mapping[str, Any]) -> list[str]:
-    """Explanations of metrics that a table calls "n/a", a line each."""
+    """Return one line of explanation for each metric that ``shown_metrics`` shows as "n/a"."""
     reasons = {
         metric.label: str(record.get(f"{metric.key}_reason") or "").partition(": ")[2]
         for metric in METRICS
@@ -261,7 +298,7 @@ def explained(record: Mapping[str, Any]) -> list[str]:
 
 
 def _worst_view(record: Mapping[str, Any], metric: Metric) -> list[tuple[str, str]]:
-    """The lowest value of a metric among the views, with its name; nothing for a single view."""
+    """Return the lowest value of a metric among the views and its view; empty for fewer than two views."""
     scored = {name: s[metric.key] for name, s in record.get("views", {}).items() if s[metric.key] is not None}
     if len(scored) < 2:
         return []
@@ -270,7 +307,7 @@ def _worst_view(record: Mapping[str, Any], metric: Metric) -> list[tuple[str, st
 
 
 def absent_metrics(record: Mapping[str, Any]) -> list[str]:
-    """Labels of what ``shown_metrics`` leaves out: no value, and no reason beside missing ground truth or layers."""
+    """Return the labels of metrics without a value and without a recorded reason (no ground truth or no such layer)."""
     return [
         metric.label
         for metric in METRICS

@@ -1,4 +1,4 @@
-"""Targets of scoring: facts of the scene as a whole, and the target of each view."""
+"""Ground truth for scores: facts of the scene, and the target of each view."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from polarguide.capture.view import listed
 from polarguide.results.evaluation.metrics import Selection, has_direction, reflective_mask, window_centers
 
 EXTENT = 1.1
-"""The extent of a scene, in units of the largest distance between two of its cameras."""
+"""Extent of a scene, relative to the largest distance between two of its cameras."""
 BLACK_SHARE = 0.99
-"""Share of the pixels outside the masks that are black where nothing but the foreground is in the pictures."""
+"""Share of black pixels outside the masks above which the pictures show only the foreground."""
 MARGIN = 3
-"""Pixels by which a mask is grown before what lies outside it is looked at."""
+"""Width in pixels of the border around a mask that belongs to no region."""
 KNOWN = {
     "mask": "masks",
     "normal": "normals",
@@ -33,6 +33,7 @@ KNOWN = {
     "diffuse": "diffuse layers",
     "object_ids": "object numbers",
 }
+"""Displayed name of each kind of ground truth."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,12 +42,13 @@ class SceneFacts:
 
     Attributes:
         extent: 1.1 times the largest distance between two cameras, in world units.
-        objects: whose errors are recorded one by one: the foreground's, if numbers and table of objects are known.
-        masks: foreground of each test view [H, W] bool, of the ground truth or else the user's; None if a view has
-            none.
-        object_only: whether nothing but the foreground is in the pictures: more than 99 % of the pixels outside the
-            masks, grown by 3 pixels, are black.
-        warnings: what scores do not mean because something is missing, a sentence each.
+        objects: objects with recorded errors: those of the foreground, if object numbers and a table of
+            objects exist.
+        masks: foreground [H, W] bool of each test view, from the ground truth or else from the user; None if
+            a view has no mask.
+        object_only: True if the pictures show only the foreground: more than 99 % of the pixels farther than
+            3 pixels from the masks are black.
+        warnings: limits of the scores because of missing data, one sentence each.
     """
 
     extent: float
@@ -57,22 +59,22 @@ class SceneFacts:
 
     @classmethod
     def of(cls, scene: Scene) -> SceneFacts:
-        """Look at the test views of a scene."""
+        """Collect the facts of the test views of a scene."""
         tests = scene.test_views
         centers = torch.stack([view.camera.center for view in scene.views]).numpy()
-        warnings = _partly_known(tests)
+        warnings = _partial_truth_warnings(tests)
         foregrounds = {view.name: foreground(view) for view in tests}
         masks = {name: mask for name, mask in foregrounds.items() if mask is not None}
         if 0 < len(masks) < len(tests):
             lacking = [name for name in foregrounds if name not in masks]
             warnings.append(
-                f"Only {len(masks)} of {len(tests)} test views have a mask (not {listed(lacking)}): stokes_error is "
-                "over whole pictures."
+                f"Only {len(masks)} of {len(tests)} test views have a mask (not {listed(lacking)}): stokes_error "
+                "covers whole pictures."
             )
         complete = masks if len(masks) == len(tests) else None
         numbered = [view for view in tests if _numbers(view) is not None]
         if numbered:
-            warnings += _unlisted(scene, numbered)
+            warnings += _object_warnings(scene, numbered)
         objects = scene.objects if numbered else ()
         return cls(
             extent=EXTENT * float(pdist(centers).max()) if len(centers) > 1 else 1.0,
@@ -84,13 +86,13 @@ class SceneFacts:
 
 
 def foreground(view: View) -> Tensor | None:
-    """The foreground [H, W] bool: the ground truth's mask, else the user's; None where neither is there."""
+    """Return the foreground [H, W] bool: the mask of the ground truth, else that of the user, else None."""
     truth = view.ground_truth
     return truth.mask if truth is not None and truth.mask is not None else view.mask
 
 
 def outside(mask: Tensor) -> Tensor:
-    """Pixels [H, W] bool that are more than ``MARGIN`` rows or columns away from a mask."""
+    """Return the pixels [H, W] bool that are more than ``MARGIN`` rows or columns away from a mask."""
     grown = binary_dilation(mask.numpy(), structure=torch.ones(3, 3).numpy(), iterations=MARGIN)
     return torch.from_numpy(~grown)
 
@@ -100,7 +102,6 @@ def _numbers(view: View) -> Tensor | None:
 
 
 def _on_black(views: Sequence[View], masks: dict[str, Tensor]) -> bool:
-    """Whether the photographs are black outside the masks."""
     black = total = 0
     for view in views:
         beyond = outside(masks[view.name]) & ~view.invalid
@@ -109,74 +110,80 @@ def _on_black(views: Sequence[View], masks: dict[str, Tensor]) -> bool:
     return total > 0 and black > BLACK_SHARE * total
 
 
-def _partly_known(views: Sequence[View]) -> list[str]:
-    """A sentence if some test views have ground truth that others lack."""
+def _partial_truth_warnings(views: Sequence[View]) -> list[str]:
     counts = {key: sum(getattr(view.ground_truth, key, None) is not None for view in views) for key in KNOWN}
     partly = [f"{KNOWN[key]} of {count}" for key, count in counts.items() if 0 < count < len(views)]
-    if not partly:
-        return []
-    return [
-        f"The ground truth gives {', '.join(partly)} of {len(views)} test views: scores against it are means over "
-        "these alone."
-    ]
+    text = (
+        f"The ground truth has {', '.join(partly)} of {len(views)} test views: these scores are means over those "
+        "views only."
+    )
+    return [text] if partly else []
 
 
-def _unlisted(scene: Scene, views: Sequence[View]) -> list[str]:
-    """Sentences about object numbers that no table explains, or whose material is not specified."""
+def _object_warnings(scene: Scene, views: Sequence[View]) -> list[str]:
+    """Return warnings about object numbers without a table entry, and about unspecified materials."""
     if not scene.objects:
         return [
-            f"The ground truth numbers objects (objid), but {scene.root / 'scene.json'} lists none (objects: id, name, "
-            "foreground, material): no errors by object or material."
+            f"The ground truth has object numbers (objid), but {scene.root / 'scene.json'} has no table of objects "
+            "(objects: id, name, foreground, material): no errors by object or material."
         ]
     listed_ids = {item.id for item in scene.objects}
-    stray: dict[int, str] = {}
+    unlisted: dict[int, str] = {}
     for view in views:
         numbers = _numbers(view)
         assert numbers is not None
         for number in numbers.unique().tolist():
             if number and number not in listed_ids:
-                stray.setdefault(number, view.name)
+                unlisted.setdefault(number, view.name)
     sentences = []
-    if stray:
+    if unlisted:
         sentences.append(
-            f"{scene.root / 'scene.json'} (objects) does not list {listed([str(number) for number in sorted(stray)])}, "
-            f"which gt/{stray[min(stray)]}.npz shows (objid): in no error by object or material."
+            f"{scene.root / 'scene.json'} (objects) does not list "
+            f"{listed([str(number) for number in sorted(unlisted)])}, although gt/{unlisted[min(unlisted)]}.npz "
+            "contains it (objid): in no error by object or material."
         )
     unclear = [item.name for item in scene.objects if item.foreground and item.material.kind is None]
     if unclear:
         sentences.append(
-            f"{scene.root / 'scene.json'} (objects) does not say whether {listed(unclear)} is a metal or a dielectric: "
-            "in no error by material."
+            f"{scene.root / 'scene.json'} (objects) does not specify whether {listed(unclear)} is a metal or a "
+            "dielectric: in no error by material."
         )
     return sentences
 
 
 JUMP = 1.05
-"""Neighboring true depths whose ratio exceeds this do not belong to one surface."""
+"""Ratio of neighboring true depths above which they belong to different surfaces."""
 JUMP_MARGIN = 2
+"""Distance in pixels to a jump of depth below which a pixel is not smooth."""
 
 
 @dataclass(frozen=True, eq=False)
 class ViewTarget:
-    """The photograph, what else is known about a view, and which pixels count; all on one device, floats as float64.
+    """Photograph, ground truth and scored pixels of a view, on one device; floats are float64.
+
+    Missing data gives None.
 
     Attributes:
         photograph: [H, W, 3] linear, S0/2.
-        valid: the pixels that count at all. windows: those of them that are centers of SSIM's windows.
-        foreground: valid pixels of the true mask; None without a mask, and then all up to ``diffuse`` is None.
-        reflective: those that are mostly seen by their reflection; None where the true specular lobe is not known.
-        surface: foreground pixels with a true normal; None where normals are not known.
-        normal: [H, W, 3] world. specular, diffuse: [H, W, 3] linear S0 of the lobes. None where not known.
+        valid: pixels of the photograph to score. windows: those that are centers of SSIM windows.
+        foreground: valid pixels of the true mask. Without a mask, this and all fields up to ``diffuse`` are
+            missing.
+        reflective: foreground pixels dominated by reflection.
+        surface: foreground pixels with a true normal.
+        normal: [H, W, 3] world. specular, diffuse: [H, W, 3] linear S0 of the lobes.
         polarization: measured S1, then S2, of each channel, [H, W, 6] linear.
-        polarized: the pixels whose polarization counts: valid, not saturated, and foreground where masks are known.
-        owner: place of each pixel's object in the scene's ``SceneFacts.objects``, as many for none, [H, W] int64.
-        dielectric: foreground pixels of objects that are known to be no metal.
-        depth: [H, W] true camera depth, 0 where not known. near: the pixels whose depth counts: foreground with a true
-            depth, any with a true depth where there is no mask.
-        smooth: valid pixels with a true depth at least 2 pixels from any jump of it.
-        mask: [H, W] float64, 1 in the foreground; None unless the pictures show nothing else.
-        beyond: valid pixels more than 3 pixels outside the mask; None likewise.
-        extent: extent of the scene, world units.
+        polarized: pixels for the Stokes error: valid, not saturated, and foreground if masks are known.
+        owner: index of each pixel's object in ``SceneFacts.objects``, or their number for no object, [H, W]
+            int64.
+        dielectric: foreground pixels of objects that are known to be dielectric.
+        depth: [H, W] true camera depth, 0 if unknown. near: pixels for the depth error: foreground pixels
+            with a true depth, or all pixels with a true depth if there is no mask.
+        smooth: valid pixels with a true depth, at least 2 pixels from any jump of it.
+        mask: [H, W] float64, 1 in the foreground; only if the pictures show nothing else.
+        beyond: valid pixels more than 3 pixels outside that mask.
+        seen: valid pixels whose content a training view shows; None if not determined.
+        seen_windows: those that are centers of SSIM windows. seen_polarized: those of ``polarized``.
+        extent: extent of the scene in world units.
     """
 
     photograph: Tensor
@@ -197,21 +204,24 @@ class ViewTarget:
     smooth: Selection | None = None
     mask: Tensor | None = None
     beyond: Selection | None = None
+    seen: Selection | None = None
+    seen_windows: Selection | None = None
+    seen_polarized: Selection | None = None
     extent: float = 1.0
 
     @classmethod
     def of(
         cls, photograph: Tensor, invalid: Tensor | None, ground_truth: Any, device: torch.device
     ) -> ViewTarget:
-        """Choose the pixels where the view lies, which is the CPU, and copy everything to the device.
+        """Select the pixels on the CPU and copy all data to a device.
 
         Args:
             photograph: [H, W, 3] linear, S0/2.
-            invalid: [H, W] bool, pixels of the photograph that do not count (saturated, dark, no data); None: all
-                count. It applies to every score.
-            ground_truth: None, or an object whose attributes may each be None: ``mask`` [H, W] bool, ``normal``
-                [H, W, 3] world, ``specular`` and ``diffuse`` [H, W, 3] linear S0 of the lobes, ``depth`` [H, W].
-            device: where the view will be rendered.
+            invalid: [H, W] bool, pixels without a valid value (saturated, dark, no data), excluded from all
+                scores; None for none.
+            ground_truth: None, or an object with optional attributes: ``mask`` [H, W] bool, ``normal`` [H, W,
+                3] world, ``specular`` and ``diffuse`` [H, W, 3] linear S0 of the lobes, ``depth`` [H, W].
+            device: device of the rendering.
         """
         valid = torch.ones(photograph.shape[:2], dtype=torch.bool) if invalid is None else ~invalid
         mask = getattr(ground_truth, "mask", None)
@@ -234,20 +244,20 @@ class ViewTarget:
             photograph=photograph.detach().to(device, torch.float64),
             valid=Selection.of(valid, device),
             windows=Selection.of(window_centers(valid), device),
-            foreground=_chosen(foreground, device),
-            reflective=_chosen(reflective, device),
-            surface=_chosen(surface, device),
-            normal=_there(maps["normal"], device),
-            specular=_there(maps["specular"], device),
-            diffuse=_there(maps["diffuse"], device),
-            depth=_there(depth, device),
-            near=_chosen(near, device),
-            smooth=_chosen(smooth, device),
+            foreground=_selection(foreground, device),
+            reflective=_selection(reflective, device),
+            surface=_selection(surface, device),
+            normal=_on_device(maps["normal"], device),
+            specular=_on_device(maps["specular"], device),
+            diffuse=_on_device(maps["diffuse"], device),
+            depth=_on_device(depth, device),
+            near=_selection(near, device),
+            smooth=_selection(smooth, device),
         )
 
     @classmethod
     def of_view(cls, view: View, facts: SceneFacts, device: torch.device) -> ViewTarget:
-        """All that is known of a test view, on a device."""
+        """Return the target of a test view with the facts of its scene."""
         target = cls.of(view.photograph(), view.invalid, view.ground_truth, device)
         masks = facts.masks
         truth = view.ground_truth
@@ -265,39 +275,56 @@ class ViewTarget:
             dielectric = torch.tensor([*plain, False])[owner] & ~view.invalid
             if truth.mask is not None:
                 dielectric &= truth.mask
-        alone = masks[view.name] if masks is not None and facts.object_only else None
+        mask = masks[view.name] if masks is not None and facts.object_only else None
         return replace(
             target,
-            polarization=_there(polarization, device),
-            polarized=_chosen(polarized, device),
+            polarization=_on_device(polarization, device),
+            polarized=_selection(polarized, device),
             owner=None if owner is None else owner.to(device),
-            dielectric=_chosen(dielectric, device),
-            mask=_there(alone, device),
-            beyond=_chosen(None if alone is None else outside(alone) & ~view.invalid, device),
+            dielectric=_selection(dielectric, device),
+            mask=_on_device(mask, device),
+            beyond=_selection(None if mask is None else outside(mask) & ~view.invalid, device),
             extent=facts.extent,
+        )
+
+    @property
+    def unseen(self) -> Tensor:
+        """Valid pixels [H, W] bool whose content no training view shows; none if not determined."""
+        return self.valid.mask & ~(self.valid if self.seen is None else self.seen).mask
+
+    def with_coverage(self, seen: Tensor) -> ViewTarget:
+        """Return the target with the pixels [H, W] bool (CPU) whose content a training view shows."""
+        device = self.photograph.device
+        counted = seen & self.valid.mask.cpu()
+        polarized = None if self.polarized is None else counted & self.polarized.mask.cpu()
+        return replace(
+            self,
+            seen=Selection.of(counted, device),
+            seen_windows=Selection.of(window_centers(counted), device),
+            seen_polarized=_selection(polarized, device),
         )
 
 
 def without_jumps(depth: Tensor) -> Tensor:
-    """Where a depth [H, W] is known and does not jump within 2 pixels: [H, W] bool.
+    """Return [H, W] bool: True for pixels with a depth and without a jump of depth within 2 pixels.
 
-    It jumps in a square of 3 x 3 pixels whose largest depth exceeds 1.05 times the smallest, or in which some pixel has
-    none. A pixel is without jumps if no such square lies in the square that reaches 2 pixels to each side.
+    A square of 3 x 3 pixels has a jump if its largest depth exceeds 1.05 times the smallest, or if a depth is
+    missing. A pixel is smooth if the square of 5 x 5 pixels around it contains no such square.
     """
     near_jump = maximum_filter(jumps(depth), size=2 * JUMP_MARGIN - 1, mode="nearest")
     return (depth > 0) & torch.from_numpy(~near_jump)
 
 
 def jumps(depth: Tensor) -> NDArray[np.bool_]:
-    """Whether a depth [H, W] jumps in the square of 3 x 3 pixels around each pixel."""
+    """Return [H, W] bool: True if a depth [H, W] jumps in the square of 3 x 3 pixels around a pixel."""
     values = depth.double().numpy()
     low, high = (f(values, size=3, mode="nearest") for f in (minimum_filter, maximum_filter))
     return np.asarray(high > JUMP * low)
 
 
-def _there(values: Tensor | None, device: torch.device) -> Tensor | None:
+def _on_device(values: Tensor | None, device: torch.device) -> Tensor | None:
     return None if values is None else values.detach().to(device).to(torch.float64)
 
 
-def _chosen(pixels: Tensor | None, device: torch.device) -> Selection | None:
+def _selection(pixels: Tensor | None, device: torch.device) -> Selection | None:
     return None if pixels is None else Selection.of(pixels, device)

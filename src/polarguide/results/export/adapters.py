@@ -1,6 +1,6 @@
-"""Shading models in exported files: fields of a PLY, and the data of a web page, by the class of the model.
+"""Adapters of shading models for exported files: fields of a PLY and data of a web page, selected by the model's class.
 
-A plug-in registers functions for its own class: ``@ply_fields.register`` and ``@page_shading.register``.
+A plug-in registers functions for its class with ``@ply_fields.register`` and ``@page_shading.register``.
 """
 
 from __future__ import annotations
@@ -18,25 +18,30 @@ from polarguide.gaussians.gaussians import Parameters
 from polarguide.gaussians.harmonics import SH_C0
 from polarguide.optics import reflectances_from_cosine
 from polarguide.shading.cubemap import box_mips
-from polarguide.shading.deferred import LOCAL_NOTE, REFLECTANCE, DeferredShading
+from polarguide.shading.deferred import LOCAL_NOTE, DeferredShading
 from polarguide.shading.directional import DirectionalShading, albedo_of
 from polarguide.shading.model import Light, PlainShading, ShadingModel
 from polarguide.shading.roughness import ggx_alpha, gltf_roughness
+from polarguide.shading.surface import surface_channels
 
-INDEX_NOTE = "Surfaces of several refractive indices are drawn with one that reflects as much at 45 degrees."
-SURROUNDINGS_NOTE = "The far surroundings have one color from all sides here; in the program they vary."
+INDEX_NOTE = (
+    "This page has one refractive index. Surfaces with another index have the same reflectance at 45 degrees."
+)
+SURROUNDINGS_NOTE = (
+    "The far surroundings have the same color from all directions on this page, unlike in the program."
+)
 
 
 @dataclass(frozen=True, eq=False)
 class PageShading:
-    """Data by which an exported page shades Gaussians as the model does.
+    """Data for shading Gaussians in an exported page.
 
     Attributes:
-        kind: the page's shaders are compiled with its name, in capitals, defined.
-        values: per Gaussian, by the names of ``results.export.share.SLOTS``, [N, ...].
-        light: cubemaps [6, R, R, C], the finest first.
-        network: matrices [rows, columns] in the order in which the shaders read them.
-        constants: further entries of the page's scene, plain JSON values.
+        kind: preprocessor symbol of the page's shaders, in lower case.
+        values: values per Gaussian, [N, ...], by the names of ``results.export.share.SLOTS``.
+        light: cubemaps [6, R, R, C], finest first.
+        network: matrices [rows, columns] in the order of the shaders.
+        constants: additional entries of the page's scene, plain JSON values.
         notes: sentences for readers of the page.
     """
 
@@ -50,28 +55,31 @@ class PageShading:
 
 @singledispatch
 def ply_fields(shading: ShadingModel, gaussians: Parameters) -> dict[str, Tensor]:
-    """Return the fields of a PLY besides display colors, [N, ...] by name: linear harmonics and surface properties."""
+    """Return the fields of a PLY in addition to display colors, [N, ...] by name.
+
+    They are linear harmonics and surface properties.
+    """
     harmonics = {"linear_dc": gaussians["sh_dc"], "linear_rest": gaussians["sh_rest"].flatten(1)}
     return harmonics | {row.name: row.values(gaussians) for row in shading.surface}
 
 
 @ply_fields.register
 def _(shading: DeferredShading, gaussians: Parameters) -> dict[str, Tensor]:
-    """The blur as glTF's ``roughness``, and the ``refractive_index`` where Gaussians have several."""
+    """Return the blur as glTF's ``roughness``, and the ``refractive_index`` if it varies."""
     fields = ply_fields.dispatch(ShadingModel)(shading, gaussians)
+    own = surface_channels(shading.surface, gaussians)
     fields.pop("index", None)
     if fields.pop("blur", None) is not None:
-        blur = shading.blur(gaussians)
-        shown = torch.zeros_like(fields["strength"]) if blur is None else blur
-        fields["roughness"] = gltf_roughness(shown, shading.environment_resolution)
-    if shading.has_indices(gaussians):
+        blur = own["blur"][:, 0] if "blur" in own else torch.zeros_like(fields["strength"])
+        fields["roughness"] = gltf_roughness(blur, shading.environment_resolution)
+    if "index" in own:
         fields["refractive_index"] = shading.refractive_index + gaussians["index_offset"]
     return fields
 
 
 @ply_fields.register
 def _(shading: DirectionalShading, gaussians: Parameters) -> dict[str, Tensor]:
-    """Harmonics, which count where ``surface`` is 0; ``albedo``, ``roughness``, ``feature`` and ``surface``."""
+    """Return ``albedo``, ``roughness``, ``feature``, ``surface``, and harmonics for a ``surface`` of 0."""
     return {
         **ply_fields.dispatch(ShadingModel)(shading, gaussians),
         "albedo": albedo_of(gaussians),
@@ -83,68 +91,65 @@ def _(shading: DirectionalShading, gaussians: Parameters) -> dict[str, Tensor]:
 
 @singledispatch
 def page_shading(shading: ShadingModel, gaussians: Parameters, light: Light) -> PageShading | None:
-    """Return the data of an exported page; None where it has no shaders for the model (colors are then baked)."""
+    """Return the data of an exported page, or None if the page has no shaders for the model and colors are baked."""
     return None
 
 
 def _harmonics(gaussians: Parameters) -> dict[str, Tensor]:
-    """The base color's harmonics as values of a page."""
     return {"color": gaussians["sh_dc"], "harmonics": gaussians["sh_rest"]}
 
 
 @page_shading.register
 def _(shading: PlainShading, gaussians: Parameters, light: Light) -> PageShading | None:
-    """Harmonics alone."""
+    """Return the harmonics."""
     return PageShading("plain", _harmonics(gaussians))
 
 
 @page_shading.register
 def _(shading: DeferredShading, gaussians: Parameters, light: Light) -> PageShading | None:
-    """Harmonics, strength and texels; of metals also their reflectance and blur."""
-    has_metal = shading.has_metal(gaussians)
-    if not shading.local and (shading.rough or has_metal):
-        return None  # no recipe has such surfaces, and the page no shaders for them
-    strength = shading.strength(gaussians)
+    """Return harmonics, strength and texels, and the reflectance and blur of metals."""
+    own = surface_channels(shading.surface, gaussians)
+    if not shading.local and (shading.rough or "metalness" in own):
+        return None  # No recipe has such surfaces.
+    strength = own["strength"][:, 0]
     notes = [LOCAL_NOTE] if shading.local else []
     index = shading.refractive_index
-    if shading.has_indices(gaussians):
-        own = index + gaussians["index_offset"].detach()
-        index = float(own.max())  # so that strengths become less, never more than 1
-        strength = strength * _at_45_degrees(own) / _at_45_degrees(index)
+    if "index" in own:
+        indices = index + own["index"][:, 0]
+        index = float(indices.max())  # Strengths decrease and stay below 1.
+        strength = strength * _at_45_degrees(indices) / _at_45_degrees(index)
         notes.append(INDEX_NOTE)
     values = {**_harmonics(gaussians), "share": strength}
     constants: dict[str, Any] = {"blend": shading.blend, "index": index}
     if shading.local:
         values |= {"own_color": gaussians["local_dc"], "own_harmonics": gaussians["local_rest"]}
-    blur = shading.blur(gaussians)
-    if blur is not None:
-        values["blur"] = blur
+    if "blur" in own:
+        values["blur"] = own["blur"][:, 0]
         constants["mirror"] = float(ggx_alpha(torch.zeros(()), shading.environment_resolution))
-    if has_metal:
-        metalness = gaussians["metalness"].detach()[:, None]
-        values["metal"] = metalness * REFLECTANCE.values(gaussians)
+    if "metalness" in own:
+        values["metal"] = own["reflectance"]
         constants["metal"] = True
     return PageShading(
         kind="local" if shading.local else "reflection",
         values=values,
-        light=shading.light_levels(light["texels"], rough=blur is not None),
+        light=shading.light_levels(light["texels"], rough="blur" in own),
         constants=constants,
         notes=notes,
     )
 
 
 def _at_45_degrees(index: Tensor | float) -> Tensor:
-    """Twice the reflectance of a dielectric at 45 degrees."""
+    """Return twice the reflectance of a dielectric at 45 degrees."""
     s, p = reflectances_from_cosine(torch.tensor(math.sqrt(0.5)), index)
     return s + p
 
 
 @page_shading.register
 def _(shading: DirectionalShading, gaussians: Parameters, light: Light) -> PageShading | None:
-    """Albedo, blur, features; the grid's levels and the MLP.
+    """Return albedo, roughness, features, the levels of the grid, and the MLP.
 
-    A record has no room for features and harmonics: the surroundings have their mean color and no features, by
-    which the page knows them.
+    A record holds either features or harmonics. So the surroundings have their mean color and zero features, and the
+    page recognizes them by these.
     """
     fields = ply_fields(shading, gaussians)
     surface = gaussians["surface"]

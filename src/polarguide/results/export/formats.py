@@ -1,13 +1,16 @@
-"""A run as the files of other programs."""
+"""Export of a run to the file formats of other programs.
+
+``model.json`` of a package states units, axes, origin, cameras, scores, and unknown quantities.
+"""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Any, get_args
 
 import numpy as np
 import torch
@@ -17,6 +20,7 @@ from polarguide.capture.presentation import colored
 from polarguide.core.errors import PolarguideError
 from polarguide.core.files import (
     atomic_folder,
+    holds_files,
     make_folder,
     require_inside,
     temporary_folder,
@@ -33,23 +37,27 @@ from polarguide.core.options import (
 )
 from polarguide.core.progress import SILENT, Reporter
 from polarguide.optics.color import srgb_encode
+from polarguide.results.evaluation.record import METRICS_FILE, read_metrics
+from polarguide.results.evaluation.table import shown_metrics
 from polarguide.results.export.adapters import ply_fields
-from polarguide.results.export.cameras import export_cameras
 from polarguide.results.export.mesh import asset_record, surface_points, write_mesh, write_points
 from polarguide.results.export.model.build import BASE_COLORS, Charted, charted_subject, textured_model
-from polarguide.results.export.model.gltf import write_glb
-from polarguide.results.export.model.obj import write_obj
-from polarguide.results.export.model.subject import subject_surface, write_stl
-from polarguide.results.export.package import RECORD, about_files, package_record
+from polarguide.results.export.model.gltf import write_glb, write_obj
+from polarguide.results.export.model.topology import subject_surface, write_stl
 from polarguide.results.export.placement import (
     GENERATOR,
+    IMAGES,
+    SUFFIX,
+    Origin,
     Placement,
     comments,
     rewrite_splats,
+    transforms,
+    write_colmap,
+    write_transforms,
 )
 from polarguide.results.export.presented import Presented
-from polarguide.results.export.splat_glb import COLOR_SPACES, Encoding, write_splat_glb
-from polarguide.results.export.splats import write_sog, write_spz
+from polarguide.results.export.splats import COLOR_SPACES, Encoding, write_sog, write_splat_glb, write_spz
 from polarguide.results.export.usd import write_splat_usdz, write_usdz
 from polarguide.results.rendering.mesh import RESOLUTION, scene_mesh
 from polarguide.results.rendering.relight import (
@@ -63,7 +71,107 @@ from polarguide.runs.model import write_run_ply
 from polarguide.runs.opened import OpenedRun
 from polarguide.visualization import figures
 
+TRANSFORMS = "transforms.json"
+
+
+def export_cameras(run: OpenedRun, presented: Presented, folder: Path, reporter: Reporter) -> list[Path]:
+    """Write ``sparse/0`` (COLMAP), ``transforms.json`` and the photographs in ``images/``.
+
+    The cameras are pinholes. So the images are undistorted, have the cameras' size, and show the color of the
+    presentation (8 bits, sRGB).
+
+    Raises:
+        PolarguideError: the folder contains pictures or a model that no export wrote.
+    """
+    model = folder / "sparse" / "0"
+    images = folder / IMAGES
+    for place in (model, images):
+        require_inside(folder, place)
+        if place.is_dir() and holds_files(place) and not (folder / TRANSFORMS).exists():
+            raise PolarguideError(
+                place,
+                expected="an empty folder or an earlier export",
+                found="other files",
+                remedy="Choose another --out.",
+            )
+    scene = run.scene
+    placement = presented.placement
+    cameras = {name: placement.camera(camera) for name, camera in run.cameras.items()}
+    about = {**presented.origin.record(), **placement.record()}
+    # This file comes first: a repeated command recognizes an interrupted export by it.
+    write_transforms(folder / TRANSFORMS, cameras, about)
+    make_folder(images)
+    color = presented.presentation.color
+    with reporter.track("photographs", len(scene.views)) as advance:
+        for number, view in enumerate(scene.views):
+            picture = figures.radiance_to_rgb(colored(view.photograph(), color))
+            figures.write_png(images / f"{view.name}{SUFFIX}", picture)
+            advance(number + 1)
+    write_colmap(
+        model, cameras, placement.points(scene.points), scene.point_colors, comments=presented.comments
+    )
+    return [model, folder / TRANSFORMS, images]
+
+
+RECORD = "model.json"
+FILES = {
+    "model.glb": "textured mesh, lit by the viewer",
+    "model-unlit.glb": "textured mesh with the picture's colors, for viewers without light",
+    "splats.ply": "splats, -y up (SuperSplat, Spark, Unity, Unreal)",
+    "splats.spz": "the same, compressed, +y up",
+    "splats.sog": "the same, compressed, -y up",
+    "splats-srgb.glb": "splats for readers that blend encoded colors (Babylon, PlayCanvas)",
+    "splats-linear.glb": "splats for readers that blend linear colors (three.js)",
+    "environment.exr": "the learned light as a panorama of linear radiance",
+    "environment.hdr": "the same in the Radiance format",
+    "environment.png": "the same as a picture",
+    "preview.png": "a view of the run as a picture",
+}
+
+
+def about_files(names: list[str]) -> dict[str, str]:
+    """Return the descriptions of files by name."""
+    return {name: FILES[name] for name in names}
+
+
+def package_record(run: OpenedRun, placement: Placement, origin: Origin, base_color: str) -> dict[str, Any]:
+    """Return the record of a package without its files.
+
+    Args:
+        run: the run; its scene is read. placement: placement of the files (+y up). origin: author and
+            provenance.
+        base_color: description of the base color.
+    """
+    unknown = [
+        "the absolute brightness of base color and light: the learned light has no absolute scale",
+        "surfaces that no camera saw: they are closed or continued from the nearest ones",
+        *([] if placement.metric else ["the length of a unit"]),
+    ]
+    color = origin.presentation.color  # applies to linear RGB of the photographs
+    cameras = {name: placement.camera(camera) for name, camera in run.cameras.items()}
+    scored = (run.folder / METRICS_FILE).exists()
+    return {
+        "generator": GENERATOR,
+        **origin.record(),
+        "units": "meters" if placement.metric else "units of the scene",
+        "up_axis": "+y",
+        "rotation_of_scene": placement.rotation.flatten().tolist(),
+        "scale_of_scene": placement.scale,
+        "color": None if color is None else color.tolist(),
+        "base_color": base_color,
+        "not_known": unknown,
+        "scores": dict(shown_metrics(read_metrics(run.folder), scores_only=True)) if scored else {},
+        "cameras": [
+            {"view": name, **{key: value for key, value in frame.items() if key != "file_path"}}
+            for name, frame in zip(cameras, transforms(cameras)["frames"], strict=True)
+        ],
+    }
+
+
 PANORAMA_HEIGHT = 512
+"""Rows of an exported environment map."""
+MILLIMETERS = 1000.0
+"""Millimeters per meter. Slicers interpret the numbers of an STL file as millimeters."""
 
 
 def export(
@@ -78,290 +186,269 @@ def export(
     model: ModelOptions = ModelOptions(),
     reporter: Reporter = SILENT,
 ) -> list[Path]:
-    """Write a run as the files of other programs, as it is presented: its subject, in its color, in meters, upright.
+    """Export a run with its presentation: its subject, in its color, in meters, upright.
 
     Args:
-        run: the run; of its scene, ply, spz and sog need poses and masks alone.
-        format: ply, spz, sog and splat-glb are ordinary splats, with reflections baked as far as harmonics carry
-            them; mesh (GLB and PLY) is fused from rendered depth, with diffuse colors and learned normals; glb and
-            obj are a textured model; points are opaque Gaussians with normals; environment is the learned light as a
-            panorama (EXR, HDR and PNG); cameras are a COLMAP model and transforms.json.
-        out: folder to write; ``export`` in the run's folder by default.
-        resolution: voxels of the mesh along its longest side, 16 to 1024.
-        spz_version: version of the SPZ file, 3 or 4; readers are split between them.
-        fields: of ply: release is the 62 floats of the 3DGS release; all adds polarguide.ply, with our linear fields.
-        axes: upright, +y in GLB and USD, -y elsewhere; or scene, the scene's own in all but GLB and USD.
+        run: the run. The formats ply, spz and sog read only poses and masks of its scene.
+        format: one of these formats. Splats (ply, spz, sog, splat-glb, splat-usdz) have reflections baked into
+            harmonics. The mesh (GLB and PLY) is fused from rendered depth and has diffuse colors and learned normals.
+            The textured model is glb, obj or usdz, and its closed surface stl. The points are opaque Gaussians with
+            normals. The environment is the learned light as a panorama (EXR, HDR and PNG). The cameras are a COLMAP
+            model and transforms.json.
+        out: folder to write; default: ``export`` in the run's folder.
+        resolution: number of voxels of the mesh along its longest side, 16 to 1024.
+        spz_version: version of the SPZ file, 3 or 4. Readers support one of them.
+        fields: fields of ply: release are the 62 floats of the 3DGS release; all adds polarguide.ply with
+            linear fields.
+        axes: upright (+y in GLB and USD, -y in other files) or scene (the scene's own axes, except in GLB and
+            USD).
         model: options of the textured model.
-        reporter: receives progress.
+        reporter: receives the progress.
 
     Returns:
-        The files and folders written.
+        The written files and folders.
 
     Raises:
-        PolarguideError: a package is missing, or the recipe has nothing of this kind.
+        PolarguideError: a package is missing, or the recipe has no data for the format.
     """
     folder = run.folder / "export" if out is None else Path(out)
     if out is None:
         require_inside(run.folder, folder)
     refuse_scene(folder)
-    writers: dict[str, Callable[[], list[Path]]] = {
-        "ply": lambda: _plys(run, presented, folder, fields),
-        "spz": lambda: _spz(run, presented, folder, spz_version),
-        "sog": lambda: _sog(run, presented, folder),
-        "splat-glb": lambda: _splat_glb(run, presented, folder),
-        "splat-usdz": lambda: _splat_usdz(run, presented, folder),
-        "mesh": lambda: _mesh(run, presented, folder, resolution, reporter),
-        "glb": lambda: _model(run, presented, folder, resolution, model, reporter, "glb"),
-        "obj": lambda: _model(run, presented, folder, resolution, model, reporter, "obj"),
-        "usdz": lambda: _model(run, presented, folder, resolution, model, reporter, "usdz"),
-        "stl": lambda: _stl(run, presented, folder / "model.stl", resolution, model, reporter),
-        "points": lambda: _points(run, presented, folder),
-        "environment": lambda: _environment(run, presented, folder, reporter),
-        "cameras": lambda: export_cameras(run, presented, folder, reporter),
-        "all": lambda: _all(run, presented, folder, resolution, spz_version, model, reporter),
-    }
-    check_choice("format", format, writers)
+    check_choice("format", format, _WRITERS)
     check_finite("resolution", resolution, 16, 1024)
     check_finite("spz_version", spz_version, 3, 4)
     check_choice("fields", fields, get_args(PlyFields))
     check_choice("axes", axes, get_args(Axes))
     if fields != "release" and format != "ply":
         raise PolarguideError(
-            "fields", expected="release, but for --format ply", found=fields, remedy="Leave it out."
+            "fields", expected="release, except for --format ply", found=fields, remedy="Omit the option."
         )
-    # Formats without Gaussians print no number of them.
-    heard = SILENT if format in ("environment", "cameras") else reporter
-    presented = Presented(run, axes=axes, masked=model.masked, reporter=heard)
+    # The number of Gaussians matters only for formats with Gaussians.
+    listener = SILENT if format in ("environment", "cameras") else reporter
+    presented = Presented(run, axes=axes, masked=model.masked, reporter=listener)
     make_folder(folder)
     with reporter.track(f"writing {format}", None):
-        return writers[format]()
-
-
-def _plys(run: OpenedRun, presented: Presented, folder: Path, fields: PlyFields) -> list[Path]:
-    paths = [_ply(run, presented, folder / "splats.ply")]
-    if fields == "all":
-        paths.append(_ply(run, presented, folder / "polarguide.ply", own_fields=True))
-    return paths
-
-
-def _ply(
-    run: OpenedRun,
-    presented: Presented,
-    path: Path,
-    placement: Placement | None = None,
-    *,
-    linear: bool = False,
-    own_fields: bool = False,
-) -> Path:
-    with temporary_folder(path.with_suffix(".whole")) as folder:
-        whole = folder / path.name
-        model = run.model
-        write_run_ply(
-            whole,
-            model.state,
-            model.shading,
-            presented.centers,
-            color=presented.presentation.color,
-            linear=linear,
-            own_fields=ply_fields(model.shading, model.state.gaussians) if own_fields else {},
+        return _WRITERS[format](
+            _Exporter(run, presented, folder, resolution, spz_version, fields, model, reporter)
         )
-        selected = None if presented.inside is None else presented.inside.cpu()
-        rewrite_splats(path, whole, placement or presented.placement, selected, presented.comments)
-    return path
 
 
-def _from_ply(
-    run: OpenedRun,
-    presented: Presented,
-    path: Path,
-    write: Callable[[Path, Path], None],
-    placement: Placement | None = None,
-) -> list[Path]:
-    """Write a file by a function of its path and of a temporary PLY."""
-    with temporary_folder(path.with_suffix(".ply")) as parts:
-        write(path, _ply(run, presented, parts / "splats.ply", placement))
-    return [path]
+@dataclass(frozen=True, eq=False)
+class _Exporter:
+    """Export of one run to a folder; see ``export``. Methods return the written files."""
 
+    run: OpenedRun
+    presented: Presented
+    folder: Path
+    resolution: int
+    spz_version: int
+    fields: PlyFields
+    options: ModelOptions
+    reporter: Reporter
 
-def _spz(run: OpenedRun, presented: Presented, folder: Path, version: int) -> list[Path]:
-    """In units of the scene: positions of the format are multiples of 1/4096 of a unit."""
-    placement = replace(presented.placement, scale=1.0, metric=False)
-    return _from_ply(run, presented, folder / "splats.spz", partial(write_spz, version=version), placement)
+    def plys(self) -> list[Path]:
+        paths = [self._ply(self.folder / "splats.ply")]
+        if self.fields == "all":
+            paths.append(self._ply(self.folder / "polarguide.ply", own_fields=True))
+        return paths
 
+    def _ply(
+        self,
+        path: Path,
+        placement: Placement | None = None,
+        *,
+        linear: bool = False,
+        own_fields: bool = False,
+    ) -> Path:
+        model = self.run.model
+        presented = self.presented
+        with temporary_folder(path.with_suffix(".unplaced")) as folder:
+            unplaced = folder / path.name
+            write_run_ply(
+                unplaced,
+                model.state,
+                model.shading,
+                presented.centers,
+                color=presented.presentation.color,
+                linear=linear,
+                own_fields=ply_fields(model.shading, model.state.gaussians) if own_fields else {},
+            )
+            inside = presented.inside.cpu()
+            rewrite_splats(path, unplaced, placement or presented.placement, inside, presented.comments)
+        return path
 
-def _sog(run: OpenedRun, presented: Presented, folder: Path) -> list[Path]:
-    credit = presented.presentation.credit
-    asset = {
-        **({"copyright": credit} if credit else {}),
-        "extras": {**presented.origin.record(), **presented.placement.record()},
-    }
-    return _from_ply(run, presented, folder / "splats.sog", partial(write_sog, asset=asset))
+    def _from_ply(
+        self, name: str, write: Callable[[Path, Path], None], placement: Placement | None = None
+    ) -> list[Path]:
+        """Write a file by a function of its path and the path of a temporary PLY."""
+        path = self.folder / name
+        with temporary_folder(path.with_suffix(".ply")) as parts:
+            write(path, self._ply(parts / "splats.ply", placement))
+        return [path]
 
+    def spz(self) -> list[Path]:
+        """Write SPZ in units of the scene, because the format rounds positions to 1/4096 of a unit."""
+        placement = replace(self.presented.placement, scale=1.0, metric=False)
+        return self._from_ply("splats.spz", partial(write_spz, version=self.spz_version), placement)
 
-def _splat_glb(run: OpenedRun, presented: Presented, folder: Path) -> list[Path]:
-    """From PLY files that are gone afterwards, one for each kind of reader."""
-    place = presented.upright(run)
-    paths: dict[Encoding, Path] = {kind: folder / f"splats-{kind}.glb" for kind in COLOR_SPACES}
-    with temporary_folder(folder / "splats.ply") as parts:
-        for kind, path in paths.items():
-            ply = _ply(run, presented, parts / f"{kind}.ply", place, linear=kind == "linear")
-            write_splat_glb(path, ply, asset_record(place, presented.origin), kind)
-    return [*paths.values()]
+    def sog(self) -> list[Path]:
+        credit = self.presented.presentation.credit
+        asset = {
+            **({"copyright": credit} if credit else {}),
+            "extras": {**self.presented.origin.record(), **self.presented.placement.record()},
+        }
+        return self._from_ply("splats.sog", partial(write_sog, asset=asset))
 
+    def splat_glbs(self) -> list[Path]:
+        """Write splats as GLB, one file for each encoding of colors."""
+        placement = self.presented.upright(self.run)
+        paths: dict[Encoding, Path] = {kind: self.folder / f"splats-{kind}.glb" for kind in COLOR_SPACES}
+        with temporary_folder(self.folder / "splats.ply") as parts:
+            for kind, path in paths.items():
+                ply = self._ply(parts / f"{kind}.ply", placement, linear=kind == "linear")
+                write_splat_glb(path, ply, asset_record(placement, self.presented.origin), kind)
+        return [*paths.values()]
 
-def _splat_usdz(run: OpenedRun, presented: Presented, folder: Path) -> list[Path]:
-    """Colors are encoded: USD leaves their space open."""
-    place = presented.upright(run)
-    about = asset_record(place, presented.origin)
-    return _from_ply(run, presented, folder / "splats.usdz", partial(write_splat_usdz, about=about), place)
+    def splat_usdz(self) -> list[Path]:
+        """Write splats as USDZ with encoded colors. USD does not define their color space."""
+        placement = self.presented.upright(self.run)
+        about = asset_record(placement, self.presented.origin)
+        return self._from_ply("splats.usdz", partial(write_splat_usdz, about=about), placement)
 
+    def mesh(self) -> list[Path]:
+        presented = self.presented
+        mesh = scene_mesh(self.run.cameras, presented.surface_view(self.run), resolution=self.resolution)
+        mesh = mesh.within(presented.subject.holds(torch.from_numpy(mesh.surface.vertices)).numpy())
+        colors = colored(torch.from_numpy(mesh.colors), presented.presentation.color).clamp(max=1)
+        mesh = replace(mesh, colors=colors.numpy())
+        paths = [self.folder / "mesh.glb", self.folder / "mesh.ply"]
+        for path in paths:
+            write_mesh(path, mesh, self.run.frame, presented.placement, presented.origin)
+        surface = mesh.surface
+        self.reporter.say(f"{len(surface.vertices):,} vertices, {len(surface.faces):,} triangles")
+        return paths
 
-def _mesh(
-    run: OpenedRun, presented: Presented, folder: Path, resolution: int, reporter: Reporter
-) -> list[Path]:
-    mesh = scene_mesh(run.cameras, presented.surface_view(run), resolution=resolution)
-    mesh = mesh.within(presented.subject.holds(torch.from_numpy(mesh.surface.vertices)).numpy())
-    colors = colored(torch.from_numpy(mesh.colors), presented.presentation.color).clamp(max=1)
-    mesh = replace(mesh, colors=colors.numpy())
-    paths = [folder / "mesh.glb", folder / "mesh.ply"]
-    for path in paths:
-        write_mesh(path, mesh, run.frame, presented.placement, presented.origin)
-    reporter.say(f"{len(mesh.surface.vertices):,} vertices, {len(mesh.surface.faces):,} triangles")
-    return paths
+    def model(self, kind: str) -> list[Path]:
+        return self._textured(self._charted(kind), self.options, kind)
 
+    def _charted(self, kind: str) -> Charted:
+        view = self.presented.surface_view(self.run)
+        inside = self.presented.subject.inside
+        with temporary_folder(self.folder / kind) as parts:
+            return charted_subject(
+                self.run, view, inside, self.options, self.resolution, parts, self.reporter
+            )
 
-def _model(
-    run: OpenedRun,
-    presented: Presented,
-    folder: Path,
-    resolution: int,
-    options: ModelOptions,
-    reporter: Reporter,
-    kind: Literal["glb", "obj", "usdz"],
-) -> list[Path]:
-    subject = _charted(run, presented, folder, resolution, options, reporter, kind)
-    return _textured(run, presented, folder, subject, options, reporter, kind)
-
-
-def _charted(
-    run: OpenedRun,
-    presented: Presented,
-    folder: Path,
-    resolution: int,
-    options: ModelOptions,
-    reporter: Reporter,
-    kind: str,
-) -> Charted:
-    view = presented.surface_view(run)
-    with temporary_folder(folder / kind) as parts:
-        return charted_subject(run, view, presented.subject.inside, options, resolution, parts, reporter)
-
-
-def _textured(
-    run: OpenedRun,
-    presented: Presented,
-    folder: Path,
-    subject: Charted,
-    options: ModelOptions,
-    reporter: Reporter,
-    kind: Literal["glb", "obj", "usdz"],
-) -> list[Path]:
-    place = presented.placement
-    textured = textured_model(run, subject, presented.presentation, place, options, reporter)
-    meaning = BASE_COLORS[options.resolved_base_color]
-    if kind == "obj":
-        upright = replace(place, upright=False)  # +y is up whatever was chosen
-        lines = [*comments(presented.origin, upright), "up_axis +y", f"base_color {meaning}"]
-        return write_obj(folder, textured, lines, jpeg=options.jpeg)
-    asset = asset_record(place, presented.origin)
-    asset["extras"]["base_color"] = meaning
-    path = folder / f"model{'-unlit' if options.unlit else ''}.{kind}"
-    (write_glb if kind == "glb" else write_usdz)(path, textured, asset, jpeg=options.jpeg)
-    return [path]
-
-
-MILLIMETERS = 1000.0
-"""In a meter: slicers take the numbers of an STL file for millimeters."""
-
-
-def _stl(
-    run: OpenedRun,
-    presented: Presented,
-    path: Path,
-    resolution: int,
-    options: ModelOptions,
-    reporter: Reporter,
-) -> list[Path]:
-    """For 3D printing: closed, in millimeters where the scale is known, and with up along z, as slicers have it."""
-    view = presented.surface_view(run)
-    options = replace(options, close_bottom=True)
-    inside = presented.subject.inside
-    surface, _, _ = subject_surface(run, view, inside, options, resolution, reporter)
-    right, up, back = run.frame.panorama_axes().numpy().T
-    axes = np.stack([right, -back, up], axis=1)
-    scale = presented.placement.scale * (MILLIMETERS if presented.placement.metric else 1.0)
-    write_stl(
-        path, scale * surface.vertices @ axes, surface.faces, f"{GENERATOR} {presented.presentation.credit}"
-    )
-    return [path]
-
-
-def _all(
-    run: OpenedRun,
-    presented: Presented,
-    folder: Path,
-    resolution: int,
-    spz_version: int,
-    options: ModelOptions,
-    reporter: Reporter,
-) -> list[Path]:
-    """A package: the model lit and unlit, splats, the light, a preview, and ``model.json``, which tells of them."""
-    lit = replace(options, unlit=False)
-    radiant = run.model.shading.radiance_cubemap is not None
-    if not radiant and options.base_color is None:
-        lit = replace(lit, base_color="diffuse")
-    unlit = replace(options, unlit=True, base_color=None)
-    with atomic_folder(folder) as parts:
-        subject = _charted(run, presented, parts, resolution, lit, reporter, "glb")
-        for chosen in (lit, unlit):
-            _textured(run, presented, parts, subject, chosen, reporter, "glb")
-        _ply(run, presented, parts / "splats.ply")
-        _spz(run, presented, parts, spz_version)
-        _sog(run, presented, parts)
-        _splat_glb(run, presented, parts)
-        if radiant:
-            _environment(run, presented, parts, reporter)
-        view = (run.scene.test_views + run.scene.train_views)[0]
-        picture = colored(run.result(view.camera).to("cpu").final, presented.presentation.color)
-        figures.write_png(parts / "preview.png", figures.radiance_to_rgb(picture))
-        names = sorted(path.name for path in parts.iterdir())
-        record = package_record(
-            run, presented.upright(run), presented.origin, BASE_COLORS[lit.resolved_base_color]
+    def _textured(self, subject: Charted, options: ModelOptions, kind: str) -> list[Path]:
+        presented = self.presented
+        placement = presented.placement
+        textured = textured_model(
+            self.run, subject, presented.presentation, placement, options, self.reporter
         )
-        write_text(parts / RECORD, json.dumps({**record, "files": about_files(names)}, indent=1) + "\n")
-    return [folder / name for name in [RECORD, *names]]
+        meaning = BASE_COLORS[options.resolved_base_color]
+        if kind == "obj":
+            upright = replace(placement, upright=False)  # The file is always +y up.
+            lines = [*comments(presented.origin, upright), "up_axis +y", f"base_color {meaning}"]
+            return write_obj(self.folder, textured, lines, jpeg=options.jpeg)
+        asset = asset_record(placement, presented.origin)
+        asset["extras"]["base_color"] = meaning
+        path = self.folder / f"model{'-unlit' if options.unlit else ''}.{kind}"
+        (write_glb if kind == "glb" else write_usdz)(path, textured, asset, jpeg=options.jpeg)
+        return [path]
+
+    def stl(self) -> list[Path]:
+        """Write a closed surface for 3D printing: +z up, in millimeters if the scale is known."""
+        presented = self.presented
+        surface, _, _ = subject_surface(
+            self.run,
+            presented.surface_view(self.run),
+            presented.subject.inside,
+            replace(self.options, close_bottom=True),
+            self.resolution,
+            self.reporter,
+        )
+        right, up, back = self.run.frame.panorama_axes().numpy().T
+        axes = np.stack([right, -back, up], axis=1)
+        scale = presented.placement.scale * (MILLIMETERS if presented.placement.metric else 1.0)
+        path = self.folder / "model.stl"
+        write_stl(
+            path,
+            scale * surface.vertices @ axes,
+            surface.faces,
+            f"{GENERATOR} {presented.presentation.credit}",
+        )
+        return [path]
+
+    def all(self) -> list[Path]:
+        """Write a package: lit and unlit model, splats, environment map, preview, and the record ``model.json``."""
+        run = self.run
+        lit = replace(self.options, unlit=False)
+        radiant = run.model.shading.radiance_cubemap is not None
+        if not radiant and lit.base_color is None:
+            lit = replace(lit, base_color="diffuse")
+        with atomic_folder(self.folder) as parts:
+            package = replace(self, folder=parts, options=lit)
+            subject = package._charted("glb")
+            for options in (lit, replace(self.options, unlit=True, base_color=None)):
+                package._textured(subject, options, "glb")
+            package._ply(parts / "splats.ply")
+            package.spz()
+            package.sog()
+            package.splat_glbs()
+            if radiant:
+                package.environment()
+            view = (run.scene.test_views + run.scene.train_views)[0]
+            preview = colored(run.result(view.camera).to("cpu").final, self.presented.presentation.color)
+            figures.write_png(parts / "preview.png", figures.radiance_to_rgb(preview))
+            names = sorted(path.name for path in parts.iterdir())
+            placement = self.presented.upright(run)
+            meaning = BASE_COLORS[lit.resolved_base_color]
+            record = package_record(run, placement, self.presented.origin, meaning)
+            write_text(parts / RECORD, json.dumps({**record, "files": about_files(names)}, indent=1) + "\n")
+        return [self.folder / name for name in [RECORD, *names]]
+
+    def points(self) -> list[Path]:
+        path = self.folder / "points.ply"
+        model = self.run.model
+        presented = self.presented
+        placement = presented.placement
+        means, normals, linear = surface_points(
+            presented.gaussians, model.shading, self.run.scene.views, model.backend.rasterize
+        )
+        colors = srgb_encode(colored(linear, presented.presentation.color).clamp(0, 1))
+        points = placement.points(means)
+        write_points(path, points, placement.directions(normals), colors, presented.comments)
+        return [path]
+
+    def environment(self) -> list[Path]:
+        run = self.run
+        presentation = self.presented.presentation
+        cubemap = needs_radiance(run.model.shading, what="format")
+        with self.reporter.track("reflected light", len(run.scene.train_views)) as progress:
+            learned = panorama(mirrored_light(run, cubemap, progress), cubemap, run.frame, PANORAMA_HEIGHT)
+        picture = colored(learned, presentation.color)
+        paths = [self.folder / f"environment.{kind}" for kind in ("exr", "hdr", "png")]
+        write_exr(paths[0], picture, {"owner": presentation.credit} if presentation.credit else {})
+        write_hdr(paths[1], picture)
+        figures.write_png(paths[2], figures.radiance_to_rgb(picture))
+        return paths
+
+    def cameras(self) -> list[Path]:
+        return export_cameras(self.run, self.presented, self.folder, self.reporter)
 
 
-def _points(run: OpenedRun, presented: Presented, folder: Path) -> list[Path]:
-    path = folder / "points.ply"
-    model = run.model
-    placement = presented.placement
-    views = run.scene.views
-    rasterize = model.backend.rasterize
-    places, normals, linear = surface_points(presented.gaussians, model.shading, views, rasterize)
-    colors = srgb_encode(colored(linear, presented.presentation.color).clamp(0, 1))
-    write_points(path, placement.points(places), placement.directions(normals), colors, presented.comments)
-    return [path]
-
-
-def _environment(run: OpenedRun, presented: Presented, folder: Path, reporter: Reporter) -> list[Path]:
-    cubemap = needs_radiance(run.model.shading, what="format")
-    with reporter.track("light that is mirrored", len(run.scene.train_views)) as progress:
-        learned = panorama(mirrored_light(run, cubemap, progress), cubemap, run.frame, PANORAMA_HEIGHT)
-    picture = colored(learned, presented.presentation.color)
-    paths = [folder / f"environment.{kind}" for kind in ("exr", "hdr", "png")]
-    credit = presented.presentation.credit
-    write_exr(paths[0], picture, {"owner": credit} if credit else {})
-    write_hdr(paths[1], picture)
-    figures.write_png(paths[2], figures.radiance_to_rgb(picture))
-    return paths
+_WRITERS: dict[str, Callable[[_Exporter], list[Path]]] = {
+    "ply": _Exporter.plys,
+    "spz": _Exporter.spz,
+    "sog": _Exporter.sog,
+    "splat-glb": _Exporter.splat_glbs,
+    "splat-usdz": _Exporter.splat_usdz,
+    "mesh": _Exporter.mesh,
+    **{kind: partial(_Exporter.model, kind=kind) for kind in ("glb", "obj", "usdz")},
+    "stl": _Exporter.stl,
+    "points": _Exporter.points,
+    "environment": _Exporter.environment,
+    "cameras": _Exporter.cameras,
+    "all": _Exporter.all,
+}

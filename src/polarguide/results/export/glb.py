@@ -1,4 +1,4 @@
-"""The container of glTF 2.0 in one binary file: a tree of JSON, and arrays that it names by number."""
+"""Binary container of glTF 2.0: a JSON tree and arrays that it references by index."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from numpy.typing import NDArray
 from polarguide.core.files import write_whole
 
 ARRAY = 34962
-"""Target of a buffer view with values at vertices."""
+"""Target of a buffer view with vertex attributes."""
 ELEMENTS = 34963
-"""Target of a buffer view with numbers of vertices."""
+"""Target of a buffer view with vertex indices."""
 _COMPONENTS = {np.dtype("<f4"): 5126, np.dtype("<u4"): 5125}
 _TYPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
 
 
 class Binary:
-    """Arrays and files of one GLB, in the order in which they are added."""
+    """Arrays and files of one GLB, in the order of their addition."""
 
     def __init__(self) -> None:
         self._data = bytearray()
@@ -29,7 +29,7 @@ class Binary:
         self._accessors: list[dict[str, Any]] = []
 
     def view(self, data: bytes, target: int | None = None) -> int:
-        """Add bytes; returns the number of their buffer view."""
+        """Add bytes and return the index of their buffer view."""
         self._data += bytes(-len(self._data) % 4)
         view = {"buffer": 0, "byteOffset": len(self._data), "byteLength": len(data)}
         self._views.append(view if target is None else {**view, "target": target})
@@ -37,15 +37,15 @@ class Binary:
         return len(self._views) - 1
 
     def array(self, values: NDArray[Any], target: int = ARRAY, *, bounds: bool = False) -> int:
-        """Add values [N] or [N, C], single precision or uint32; returns the number of their accessor.
+        """Add values [N] or [N, C], float32 or uint32, and return the index of their accessor.
 
         Args:
-            values: the array. target: what it is for. bounds: whether to tell the smallest and the largest value, as
-                positions have to.
+            values: the array. target: target of the buffer view.
+            bounds: record the minimum and the maximum, which positions require.
         """
         table = values.reshape(len(values), -1)
-        accessor = {
-            "bufferView": self.view(np.ascontiguousarray(values).tobytes(), target),
+        accessor: dict[str, Any] = {
+            "bufferView": self.view(values.tobytes(), target),
             "componentType": _COMPONENTS[values.dtype],
             "count": len(table),
             "type": _TYPES[table.shape[1]],
@@ -58,11 +58,12 @@ class Binary:
     def write(
         self, path: Path, asset: dict[str, Any], primitive: dict[str, Any], more: dict[str, Any]
     ) -> None:
-        """Write the file of one primitive.
+        """Write a file with one primitive.
 
         Args:
-            path: the file. asset: whom and what made it, without the version. primitive: primitive of the only mesh.
-            more: further fields of the tree.
+            path: the file. asset: glTF asset record without the version. primitive: primitive of the only
+                mesh.
+            more: additional fields of the tree.
 
         Raises:
             PolarguideError: the file cannot be written.
@@ -81,10 +82,6 @@ class Binary:
         }
         text = json.dumps(tree).encode()
         text += b" " * (-len(text) % 4)
-        head = struct.pack("<4sII", b"glTF", 2, 12 + 8 + len(text) + 8 + len(self._data))
-        chunks = [
-            struct.pack("<I4s", len(text), b"JSON"),
-            text,
-            struct.pack("<I4s", len(self._data), b"BIN\0"),
-        ]
-        write_whole(path, b"".join([head, *chunks, self._data]))
+        length = 12 + 8 + len(text) + 8 + len(self._data)
+        head = struct.pack("<4sIII4s", b"glTF", 2, length, len(text), b"JSON")
+        write_whole(path, head + text + struct.pack("<I4s", len(self._data), b"BIN\0") + self._data)

@@ -1,4 +1,4 @@
-"""A trained scene's surface as files: a triangle mesh, and a plain point cloud with normals."""
+"""Export of a scene's surface: a triangle mesh, and a point cloud with normals."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.lib.recfunctions import unstructured_to_structured
 from plyfile import PlyData, PlyElement
 from torch import Tensor
 
@@ -29,6 +30,7 @@ from polarguide.results.export.placement import (
     with_comments,
 )
 from polarguide.results.rendering.mesh import ColoredMesh
+from polarguide.shading.gbuffer import diffuse_colors
 from polarguide.shading.model import Parameters, ShadingModel
 from polarguide.training.callbacks import outward_directions
 
@@ -40,11 +42,12 @@ def write_mesh(
     placement: Placement = IN_PLACE,
     origin: Origin = NOBODY,
 ) -> None:
-    """Write a mesh: PLY with display colors, or GLB, upright (+y), with linear colors as glTF has them.
+    """Write a mesh as PLY with display colors, or as GLB (+y up) with linear colors.
 
     Args:
-        path: the file, .ply or .glb. mesh: in the scene's axes. around: its frame.
-        placement: placement of the PLY; the GLB has its units alone. origin: whom the file is owed to.
+        path: the file, .ply or .glb. mesh: the mesh in the scene's axes. around: the scene's frame.
+        placement: placement of the PLY. The GLB uses only its scale.
+        origin: author and provenance.
 
     Raises:
         PolarguideError: trimesh is not installed.
@@ -75,7 +78,7 @@ def write_mesh(
 
         def about(tree: dict[str, Any]) -> None:
             tree["asset"] |= asset_record(placement, origin)
-            # Without a material a reader has to take a rough metal, which shows no diffuse color.
+            # The default material of glTF is a rough metal, which shows no diffuse color.
             tree["materials"] = [{"name": "diffuse", "pbrMetallicRoughness": DIELECTRIC}]
             tree["meshes"][0]["primitives"][0]["material"] = 0
 
@@ -86,8 +89,8 @@ def write_mesh(
 
 
 def asset_record(placement: Placement, origin: Origin) -> dict[str, Any]:
-    """The asset record of a glTF file. Its unit is the meter; where the scale is not known, ``units`` says so."""
-    units = "meters" if placement.metric else "units of the scene; how long one is, is not known"
+    """Return the asset record of a glTF file. The unit of glTF is the meter; ``units`` states an unknown scale."""
+    units = "meters" if placement.metric else "units of the scene; their length is unknown"
     credit = origin.presentation.credit
     return {
         "generator": GENERATOR,
@@ -97,8 +100,9 @@ def asset_record(placement: Placement, origin: Origin) -> dict[str, Any]:
 
 
 DIELECTRIC = {"metallicFactor": 0.0, "roughnessFactor": 1.0}
-"""Material of glTF that shows vertex colors as a diffuse surface."""
+"""glTF material that shows vertex colors as a diffuse surface."""
 OPAQUE = 0.5
+"""Opacity above which a Gaussian belongs to a surface."""
 FIELDS = [(name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")] + [
     (name, "u1") for name in ("red", "green", "blue")
 ]
@@ -111,10 +115,10 @@ def surface_points(
     views: Iterable[View],
     rasterize: Rasterize,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Positions, outward unit normals and linear diffuse colors, each [M, 3], of opaque Gaussians that a view sees.
+    """Return positions, outward unit normals and linear diffuse colors, each [M, 3], of visible opaque Gaussians.
 
     Raises:
-        PolarguideError: there are none.
+        PolarguideError: no opaque Gaussian is visible in any view.
     """
     outward = outward_directions(gaussians, views, rasterize)
     opaque = torch.sigmoid(gaussians["opacity_logits"]) >= OPAQUE
@@ -122,7 +126,7 @@ def surface_points(
     if not len(indices):
         raise PolarguideError(
             "--format points",
-            expected="opaque Gaussians that a view sees",
+            expected="opaque Gaussians that are visible in a view",
             found="none",
             remedy="Train for more steps.",
         )
@@ -132,21 +136,20 @@ def surface_points(
         means, gaussians["quaternions"][indices], gaussians["log_scales"][indices], torch.zeros(3)
     )
     normals = torch.where((normals * side).sum(dim=1, keepdim=True) < 0, -normals, normals)
-    few = {name: gaussians[name][indices] for name in (*CORE_SHAPES, *shading.parameters)}
-    return means, normals, shading.diffuse_colors(few, -normals.contiguous())
+    selected = {name: gaussians[name][indices] for name in (*CORE_SHAPES, *shading.parameters)}
+    return means, normals, diffuse_colors(selected, shading, -normals.contiguous())
 
 
 def write_points(
     path: Path, points: Tensor, normals: Tensor, colors: Tensor, comments: Sequence[str] = ()
 ) -> None:
-    """Write a PLY of points, with comments."""
-    table = np.empty(len(points), dtype=FIELDS)
-    values = np.concatenate((points.numpy(), normals.numpy()), axis=1)
-    for index, (name, _) in enumerate(FIELDS[:6]):
-        table[name] = values[:, index]
-    shades = np.rint(colors.numpy() * 255).astype(np.uint8)
-    for index, name in enumerate(("red", "green", "blue")):
-        table[name] = shades[:, index]
+    """Write a PLY of points with comments.
+
+    Args:
+        path: the file. points, normals: [M, 3]. colors: [M, 3] encoded, in [0, 1].
+    """
+    values = np.concatenate((points.numpy(), normals.numpy(), np.rint(colors.numpy() * 255)), axis=1)
+    table = unstructured_to_structured(values, np.dtype(FIELDS))
     with atomic(path) as temporary:
         element = PlyElement.describe(table, "vertex", comments=list(comments))
         PlyData([element], byte_order="<").write(temporary)

@@ -1,4 +1,4 @@
-"""The axes and units of exported files, what the files say of themselves, and poses as other programs read them."""
+"""Axes, units and comments of exported files, and camera poses for other programs."""
 
 from __future__ import annotations
 
@@ -29,17 +29,17 @@ from polarguide.geometry.scene_frame import SceneFrame
 from polarguide.geometry.vectors import spread_directions
 
 HARMONICS = ("f_rest", "linear_rest")
-"""Fields of harmonics in our PLY files; the first channel-major, the second with the channel last."""
+"""Fields of harmonics in our PLY files. The first is channel-major, the second has the channel last."""
 
 
 @dataclass(frozen=True, eq=False)
 class Placement:
-    """How exported files lie: the scene turned by a rotation, then in other units.
+    """Placement of exported files: a rotation and a scale of the scene.
 
     Attributes:
         rotation: [3, 3] float64, from the scene's axes to the file's.
-        scale: the file's units in one unit of the scene, positive.
-        metric: whether the file's unit is the meter. upright: whether up is -y in it.
+        scale: units of the file per unit of the scene, positive.
+        metric: the file's unit is the meter. upright: up is -y in the file.
     """
 
     rotation: Tensor
@@ -49,12 +49,13 @@ class Placement:
 
     @classmethod
     def of(cls, presentation: Presentation, around: SceneFrame | None) -> Placement:
-        """In meters where the scale is known; up along -y, or in the scene's own axes.
+        """Return a placement in meters if the scale is known, with -y up or in the scene's own axes.
 
-        -y is up in files of Gaussians as in the photographs' own axes: x right, y down, z ahead.
+        In files of Gaussians up is -y, as in the axes of a photograph: x right, y down, z forward.
 
         Args:
-            presentation: of the run. around: the scene's frame with its up axis; None: the scene's own axes.
+            presentation: presentation of the run.
+            around: the scene's frame with its up axis; None keeps the scene's own axes.
         """
         scale = presentation.meters_per_unit
         rotation = torch.eye(3, dtype=torch.float64)
@@ -65,36 +66,35 @@ class Placement:
 
     @property
     def changes(self) -> bool:
-        """Whether anything lies otherwise than in the scene."""
+        """True if the placement is not the identity."""
         return self.upright or self.scale != 1.0
 
     def points(self, places: Tensor) -> Tensor:
-        """Places [N, 3] of the scene as the file has them."""
+        """Convert points [N, 3] of the scene to the file."""
         return self.scale * self.directions(places)
 
     def directions(self, vectors: Tensor) -> Tensor:
-        """Directions [N, 3] of the scene as the file has them."""
+        """Convert directions [N, 3] of the scene to the file."""
         return vectors @ self.rotation.T.to(vectors)
 
     def camera(self, camera: Camera) -> Camera:
-        """A camera of the scene as the file has it."""
+        """Convert a camera of the scene to the file."""
         return Camera(
             camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy,
             camera.rotation @ self.rotation.T, self.scale * camera.translation,
         )  # fmt: skip
 
     def harmonics(self) -> NDArray[np.float64]:
-        """Rotation of coefficients of degree 1 to 3 with the scene, [15, 15]: new = matrix @ old.
+        """Return the rotation of harmonics of degree 1 to 3 as a matrix [15, 15]: new = matrix @ old.
 
-        Functions of each degree turn into functions of the same degree, so that a fit to samples is exact.
+        Each degree is closed under rotations, so that a fit to samples is exact.
         """
         directions = spread_directions(64)
         before = sh_basis(directions @ self.rotation, 3)[:, 1:]
-        turned = torch.linalg.lstsq(sh_basis(directions, 3)[:, 1:], before).solution
-        return np.asarray(turned.numpy())
+        return np.asarray(torch.linalg.lstsq(sh_basis(directions, 3)[:, 1:], before).solution.numpy())
 
     def place(self, table: NDArray[Any]) -> None:
-        """Move the Gaussians of a PLY, a structured array as ``write_ply`` writes it, in place."""
+        """Transform the Gaussians of a PLY, a structured array in the layout of ``write_ply``, in place."""
         if not self.changes:
             return
         for fields, scale in ((("x", "y", "z"), self.scale), (("nx", "ny", "nz"), 1.0)):
@@ -105,9 +105,9 @@ class Placement:
             table[f"scale_{k}"] += math.log(self.scale)
         if not self.upright:
             return
-        own = np.stack([table[f"rot_{k}"] for k in range(4)], axis=1).astype(np.float64)
-        turned = Rotation.from_matrix(self.rotation.numpy()) * Rotation.from_quat(own[:, [1, 2, 3, 0]])
-        for k, column in enumerate(turned.as_quat().T[[3, 0, 1, 2]]):
+        quaternions = np.stack([table[f"rot_{k}"] for k in (1, 2, 3, 0)], axis=1).astype(np.float64)
+        rotated = Rotation.from_matrix(self.rotation.numpy()) * Rotation.from_quat(quaternions)
+        for k, column in enumerate(rotated.as_quat().T[[3, 0, 1, 2]]):
             table[f"rot_{k}"] = column
         matrix = self.harmonics()
         names = table.dtype.names or ()
@@ -124,30 +124,28 @@ class Placement:
                     table[name] = column
 
     def record(self) -> dict[str, Any]:
-        """The record in exported files: ``units``, ``up_axis``, and how the scene was turned and scaled."""
-        record: dict[str, Any] = {"units": "meters" if self.metric else "units of the scene"}
-        if self.upright:
-            record["up_axis"] = "-y"
-        if self.metric:
-            record["meters_per_unit_of_scene"] = self.scale
-        if self.upright:
-            record["rotation_of_scene"] = self.rotation.flatten().tolist()
-        return record
+        """Return the record in exported files: ``units``, ``up_axis``, rotation and scale of the scene."""
+        return {
+            "units": "meters" if self.metric else "units of the scene",
+            **({"up_axis": "-y"} if self.upright else {}),
+            **({"meters_per_unit_of_scene": self.scale} if self.metric else {}),
+            **({"rotation_of_scene": self.rotation.flatten().tolist()} if self.upright else {}),
+        }
 
 
 @dataclass(frozen=True)
 class Origin:
-    """Whom a file is owed to, and where it comes from.
+    """Author and provenance of a file.
 
     Attributes:
-        presentation: author, license, provenance and title. made_of: recipe, steps and the digest of the scene.
+        presentation: author, license, provenance and title. made_of: recipe, steps and digest of the scene.
     """
 
     presentation: Presentation
     made_of: str
 
     def record(self) -> dict[str, str]:
-        """By the names that Sketchfab gave to the extras of a glTF asset; what is not known is left out."""
+        """Return the known values under Sketchfab's names of the extras of a glTF asset."""
         presentation = self.presentation
         texts = {
             "title": presentation.title,
@@ -165,39 +163,36 @@ GENERATOR = f"polarguide {__version__}"
 
 
 def comments(origin: Origin, placement: Placement) -> list[str]:
-    """The comments of a PLY or COLMAP file, a line each, in ASCII."""
+    """Return the comments of a PLY or COLMAP file, one ASCII line each."""
     about = {"generator": GENERATOR, **origin.record(), **placement.record()}
     return [f"{name} {_ascii(value)}" for name, value in about.items()]
 
 
 def _ascii(value: Any) -> str:
-    """In ASCII, as headers of PLY files have to be: without accents, and what is left as numbers of characters."""
+    """Convert a value to ASCII for the header of a PLY file, without accents and with escaped characters."""
     text = " ".join(f"{number:.9g}" for number in value) if isinstance(value, list) else str(value)
-    text = unicodedata.normalize("NFKD", text.replace("©", "(c)"))
-    return (
-        "".join(c for c in text if not unicodedata.combining(c)).encode("ascii", "backslashreplace").decode()
-    )
+    decomposed = unicodedata.normalize("NFKD", text.replace("©", "(c)"))
+    plain = "".join(character for character in decomposed if not unicodedata.combining(character))
+    return plain.encode("ascii", "backslashreplace").decode()
 
 
 def with_comments(ply: bytes, lines: list[str]) -> bytes:
-    """A PLY file with comments after the line of its first element, which the SIBR viewer looks for as the third."""
+    """Insert comments into a PLY file after the line of its first element, which SIBR expects as third line."""
     match = re.search(rb"^element [^\n]*\n", ply, re.MULTILINE)
     assert match is not None
     added = "".join(f"comment {line}\n" for line in lines).encode("ascii")
     return ply[: match.end()] + added + ply[match.end() :]
 
 
-def rewrite_splats(
-    path: Path, ply: Path, placement: Placement, mask: Tensor | None, lines: list[str]
-) -> None:
-    """Write a PLY of Gaussians as it is exported.
+def rewrite_splats(path: Path, ply: Path, placement: Placement, mask: Tensor, lines: list[str]) -> None:
+    """Write a PLY of Gaussians with a placement.
 
     Args:
-        path: the file to write. ply: as ``write_run_ply`` wrote it.
-        mask: [N] bool, which Gaussians are kept; None: all. lines: comments.
+        path: the file to write. ply: file from ``write_run_ply``. placement: placement of the file.
+        mask: [N] bool, the Gaussians to keep. lines: comments.
     """
     element = PlyData.read(ply)["vertex"]
-    table = np.array(element.data if mask is None else element.data[mask.numpy()])
+    table = element.data[mask.numpy()]
     placement.place(table)
     vertices = PlyElement.describe(table, "vertex", comments=[*element.comments, *lines])
     with atomic(path) as temporary:
@@ -205,10 +200,9 @@ def rewrite_splats(
 
 
 IMAGES = "images"
-"""Folder of the exported images."""
 SUFFIX = ".png"
 """Suffix of the exported images."""
-# nerfstudio's cameras look along -z with y up: OpenGL's axes, not OpenCV's.
+# nerfstudio uses OpenGL axes: the camera looks along -z, and y is up.
 _OPENGL = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
 
 
@@ -220,11 +214,11 @@ def write_colmap(
     *,
     comments: Sequence[str] = (),
 ) -> None:
-    """Write a COLMAP model as text: one camera and one image a view, and points without tracks.
+    """Write a COLMAP model as text: one camera and one image per view, and points without tracks.
 
     Args:
-        folder: made if there is none. cameras: by view. points: [M, 3]. colors: [M, 3] uint8.
-        comments: lines for the head of each file.
+        folder: the folder to write. cameras: cameras by view. points: [M, 3]. colors: [M, 3] uint8.
+        comments: lines for the header of each file.
     """
     model = pycolmap.Reconstruction()
     for number, (name, camera) in enumerate(cameras.items(), start=1):
@@ -243,11 +237,11 @@ def write_colmap(
         head = "".join(f"# {line}\n" for line in comments).encode()
         for path in temporary.iterdir():
             path.write_bytes(head + path.read_bytes())
-        _require_whole(temporary, len(cameras), len(points))
+        _require_complete(temporary, len(cameras), len(points))
 
 
-def _require_whole(folder: Path, images: int, points: int) -> None:
-    """Read a model back: pycolmap does not say where the disk was full.
+def _require_complete(folder: Path, images: int, points: int) -> None:
+    """Read a model back, because pycolmap does not report a full disk.
 
     Raises:
         OSError: the model is incomplete.
@@ -255,15 +249,15 @@ def _require_whole(folder: Path, images: int, points: int) -> None:
     try:
         model = pycolmap.Reconstruction()
         model.read_text(str(folder))
-        whole = (len(model.images), len(model.points3D)) == (images, points)
-    except Exception:  # whatever C++ threw
-        whole = False
-    if not whole:
-        raise OSError("a file that was cut short, as on a full disk")
+        complete = (len(model.images), len(model.points3D)) == (images, points)
+    except Exception:  # pycolmap raises different exceptions of C++.
+        complete = False
+    if not complete:
+        raise OSError("a truncated file; the disk may be full")
 
 
 def transforms(cameras: Mapping[str, Camera]) -> dict[str, Any]:
-    """The record of ``transforms.json``: intrinsics and camera-to-world matrices in OpenGL's axes, one frame a view."""
+    """Return the record of ``transforms.json``: intrinsics and camera-to-world matrices in OpenGL axes."""
     frames = []
     for name, camera in cameras.items():
         pose = torch.eye(4, dtype=torch.float64)
@@ -271,8 +265,12 @@ def transforms(cameras: Mapping[str, Camera]) -> dict[str, Any]:
         frames.append(
             {
                 "file_path": f"{IMAGES}/{name}{SUFFIX}",
-                **{"fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy},
-                **{"w": camera.width, "h": camera.height},
+                "fl_x": camera.fx,
+                "fl_y": camera.fy,
+                "cx": camera.cx,
+                "cy": camera.cy,
+                "w": camera.width,
+                "h": camera.height,
                 "transform_matrix": (pose @ _OPENGL).tolist(),
             }
         )
@@ -280,5 +278,9 @@ def transforms(cameras: Mapping[str, Camera]) -> dict[str, Any]:
 
 
 def write_transforms(path: Path, cameras: Mapping[str, Camera], about: Mapping[str, Any] = {}) -> None:
-    """Write ``transforms.json``; ``about``: further fields, which readers ignore."""
+    """Write ``transforms.json``.
+
+    Args:
+        path: the file. cameras: cameras by view. about: additional fields, which readers ignore.
+    """
     write_text(path, json.dumps({**transforms(cameras), **about}, indent=1) + "\n")

@@ -1,4 +1,4 @@
-"""A run as its presentation shows it, for whatever leaves it: its subject, upright, with its origin."""
+"""Presentation of a run in exported files: its subject, upright, with its provenance."""
 
 from __future__ import annotations
 
@@ -21,19 +21,21 @@ from polarguide.shading.model import Parameters
 from polarguide.shading.result import RenderResult
 
 ALL = Subject(None, "everything")
+"""The whole scene as a subject."""
 
 
 class Presented:
-    """A run as its presentation shows it: the Gaussians of its subject, their placement, and the origin of files.
+    """Presentation of a run: the Gaussians of its subject, their placement, and the provenance of files.
 
-    Where the scene is not there any more, which tells what is up and what is the subject, it is all of the Gaussians
-    in the scene's own axes, with a warning.
+    If the scene is missing, the up axis and the subject are unknown. Then all Gaussians are exported in the
+    scene's own axes, with a warning.
 
     Args:
-        run: the run. axes: of the placement. masked: as of ``subject_of``. reporter: receives the line of ``Subject``.
+        run: the run. axes: axes of the placement. masked: see ``subject_of``.
+        reporter: receives a line about removed Gaussians.
 
     Raises:
-        PolarguideError: the presentation cannot be read, or none of the Gaussians belongs to the subject.
+        PolarguideError: the presentation cannot be read, or no Gaussian belongs to the subject.
     """
 
     def __init__(
@@ -50,7 +52,7 @@ class Presented:
         if self.poses is not None or self.presentation.crop is not None:
             self.subject = subject_of(run, masked=masked)
         model = run.model
-        self.inside = self._chosen(run, reporter)
+        self.inside = self._members(run, reporter)
         self.gaussians: Parameters = model.state.gaussians.only(self.inside)
         footprints = model.state.footprints
         self.footprints = None if footprints is None else footprints[self.inside]
@@ -65,49 +67,49 @@ class Presented:
 
     @staticmethod
     def _known_poses(run: OpenedRun) -> list[Camera] | None:
-        """The scene's cameras; None where the scene is not there, with a warning."""
+        """Return the scene's cameras, or None with a warning if the scene is missing."""
         if run.scene_is_there:
             return [*run.poses.values()]
         warnings.warn(
-            f"The scene of {run.folder} is not at {run.scene_folder} any more: files lie in its own axes, with all "
-            f"Gaussians, and normals are turned away from their middle, not to the nearest camera. {run.new_place}",
+            f"The scene of {run.folder} is no longer at {run.scene_folder}: files have its own axes and contain all "
+            "Gaussians, and normals point away from the center of the Gaussians instead of to the nearest camera. "
+            f"{run.new_place}",
             PolarguideWarning,
             stacklevel=5,
         )
         return None
 
-    def _chosen(self, run: OpenedRun, reporter: Reporter) -> Tensor:
-        """Which Gaussians belong to the subject, [N] bool."""
+    def _members(self, run: OpenedRun, reporter: Reporter) -> Tensor:
+        """Return the Gaussians that belong to the subject, [N] bool."""
         inside = self.subject.holds(run.model.state.gaussians["means"])
-        kept = int(inside.sum())
-        if not kept:
+        count = int(inside.sum())
+        if not count:
             raise PolarguideError(
                 "the crop box" if self.presentation.crop is not None else "the subject",
-                expected=f"Gaussians in it ({self.subject.words})",
+                expected=f"Gaussians inside ({self.subject.description})",
                 found=f"none of {len(inside)}",
-                remedy="Move it: polarguide present RUN --crop, or in polarguide view.",
+                remedy="Move the box with polarguide present RUN --crop or in polarguide view.",
             )
-        if line := self.subject.told(kept, len(inside), run):
-            reporter.say(line)
+        self.subject.report_removed(inside, run, reporter)
         return inside
 
     @property
     def centers(self) -> Tensor | None:
-        """Centers of the scene's cameras [M, 3], which tell on what side surfaces are seen; None: not known."""
+        """Centers of the scene's cameras [M, 3] for the orientation of surfaces; None if unknown."""
         return None if self.poses is None else torch.stack([camera.center for camera in self.poses])
 
     def upright(self, run: OpenedRun) -> Placement:
-        """The placement in formats whose up is +y."""
+        """Return the placement for formats with +y up."""
         axes = run.frame.panorama_axes()
         return replace(self.placement, rotation=axes.T, upright=True)
 
     @property
     def comments(self) -> list[str]:
-        """For the head of a file."""
+        """Comments for the header of a file."""
         return comments(self.origin, self.placement)
 
     def surface_view(self, run: OpenedRun) -> Callable[[Camera], RenderResult]:
-        """Renders a view of the Gaussians of the subject, with the surface at the median depth."""
+        """Return a function that renders the Gaussians of the subject with the surface at the median depth."""
         model = run.model
 
         @torch.no_grad()

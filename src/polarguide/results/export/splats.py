@@ -1,10 +1,14 @@
-"""Splats in two compressed formats, from the PLY of a run: Niantic's SPZ and PlayCanvas' SOG.
+"""Export of splats from the PLY of a run: Niantic's SPZ, PlayCanvas' SOG, and glTF.
 
-SOG is pictures in a ZIP file, after its specification, version 2:
+SOG is a ZIP file of pictures. Its specification, version 2, is at
 https://developer.playcanvas.com/user-manual/gaussian-splatting/formats/sog
 
-Its writer is ours, because GaussForge 0.6 writes 65,000 Gaussians in eight seconds, but had not finished 88,623 after
-six minutes.
+We write SOG ourselves, because GaussForge 0.6 writes 65,000 Gaussians in eight seconds but did not finish
+88,623 in six minutes.
+
+glTF uses the extension ``KHR_gaussian_splatting`` (kernel ``ellipse``). It stores linear scales, opacities in [0, 1], quaternions (x, y, z, w) and the harmonics of 3DGS.
+Its ``colorSpace`` states the encoding of colors, but readers ignore it. So there is one file for each kind of
+reader.
 """
 
 from __future__ import annotations
@@ -14,7 +18,7 @@ import math
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -25,44 +29,46 @@ from torch import Tensor
 from polarguide.core.errors import PolarguideError, optional_import
 from polarguide.core.files import atomic, write_whole
 from polarguide.gaussians.ply import read_ply, write_ply
-from polarguide.results.export.share import curve_places
+from polarguide.results.export.glb import Binary
+from polarguide.results.export.web_page import curve_places
 
-# Signs of the harmonics of degree 1 to 3, in the order of a PLY, after half a turn about x: y and z change theirs.
+# Signs of the harmonics of degree 1 to 3, in the order of a PLY, after a half turn about x.
 _HALF_TURN_HARMONICS = (-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1)
 
 
 def write_spz(path: Path, ply: Path, version: int = 3) -> None:
-    """Convert a PLY of Gaussians to SPZ, which has no place for the fields that only polarguide reads.
+    """Convert a PLY of Gaussians to SPZ without our own fields.
 
-    The axes of SPZ are right, up and back: the scene is turned by 180 degrees about x, and readers of SPZ turn it back.
-    Positions are rounded to 1/4096 of the world's unit. Colors and scales keep 8 bits, harmonics 5 or 4 by degree.
+    The axes of SPZ are right, up and back. So the scene is rotated by 180 degrees about x, which readers of
+    SPZ revert. Positions are rounded to 1/4096 of a unit. Colors and scales have 8 bits, harmonics 5 or 4
+    bits by degree.
 
     Args:
         path: file to write.
-        ply: file as ``write_run_ply`` writes it.
-        version: 3, or 4 (zstd in place of gzip).
+        ply: file from ``write_run_ply``.
+        version: 3, or 4 (zstd instead of gzip).
 
     Raises:
-        PolarguideError: the converter is not installed, or cannot convert the file.
+        PolarguideError: the converter is not installed or cannot convert the file.
     """
     converter = optional_import("gaussforge", "--format spz").GaussForge()
     converted = converter.convert(_half_turned(ply).read_bytes(), "ply", "spz", spz_version=version)
     if "error" in converted:
         raise PolarguideError(
             ply,
-            expected="Gaussians that spz can hold",
+            expected="Gaussians that SPZ can represent",
             found=str(converted["error"]),
-            remedy="Export them as ply.",
+            remedy="Export to ply instead.",
         )
     write_whole(path, bytes(converted["data"]))
 
 
 def _half_turned(ply: Path) -> Path:
-    """The same Gaussians beside the file, half a turn about the world's x further."""
+    """Write the Gaussians, rotated by 180 degrees about the world's x, to a second file in the same folder."""
     gaussians = read_ply(ply)
     gaussians.pop("extra")
     gaussians["means"] = gaussians["means"] * torch.tensor([1.0, -1.0, -1.0])
-    # Half a turn of the world and of each Gaussian's own axes, which does not change its shape.
+    # The sign change also turns each Gaussian by 180 degrees about its own axis, which preserves its shape.
     gaussians["quaternions"] = gaussians["quaternions"] * torch.tensor([1.0, 1.0, -1.0, -1.0])
     gaussians["sh_rest"] = gaussians["sh_rest"] * torch.tensor(_HALF_TURN_HARMONICS)[None, :, None]
     turned = ply.with_name("turned.ply")
@@ -72,20 +78,24 @@ def _half_turned(ply: Path) -> Path:
 
 CODES = 256
 PALETTE_ROW = 64
+"""Number of palette entries per row of a picture."""
 LARGEST_PALETTE = 8192
+"""Maximum size of the palette of harmonics."""
 ROUNDS = 8
+"""Number of iterations of Lloyd's algorithm."""
 SEED = 0
 Pixels = NDArray[np.uint8]
 
 
 def write_sog(path: Path, ply: Path, asset: Mapping[str, Any] = {}) -> None:
-    """Convert a PLY of Gaussians; our own fields in it are left out. A fixed file for a fixed PLY.
+    """Convert a PLY of Gaussians to SOG without our own fields. The result is deterministic.
 
-    Positions keep 16 bits of their signed logarithm, rotations 8 bits a component, the rest a code of 256 values;
-    harmonics beyond the first become one of at most 8,192.
+    Positions have 16 bits of their signed logarithm, rotations 8 bits per component, other values a code of
+    256 values. Harmonics of degree 1 to 3 are entries of a palette of at most 8,192.
 
     Args:
-        path: the file to write. ply: as ``write_run_ply`` writes it. asset: what ``meta.json`` says of the file.
+        path: the file to write. ply: file from ``write_run_ply``. asset: fields of the asset in
+            ``meta.json``.
     """
     gaussians = {name: values for name, values in read_ply(ply).items() if name != "extra"}
     order = _morton_order(gaussians["means"])
@@ -107,7 +117,7 @@ def write_sog(path: Path, ply: Path, asset: Mapping[str, Any] = {}) -> None:
 
 
 def _store(file: zipfile.ZipFile, name: str, data: bytes) -> None:
-    """Without the time, so that the same splats make the same file."""
+    """Store a file without a time stamp, so that equal splats give equal files."""
     file.writestr(zipfile.ZipInfo(name), data)
 
 
@@ -119,7 +129,7 @@ def _lossless(pixels: Pixels) -> bytes:
 
 
 def _picture(values: Tensor, width: int) -> Pixels:
-    """Rows [N, 3 or 4] of bytes as a picture [H, width, 4]; opaque where there is no fourth."""
+    """Arrange rows [N, 3 or 4] of bytes as a picture [H, width, 4], opaque by default."""
     count, channels = values.shape
     pixels = np.zeros((math.ceil(count / width) * width, 4), dtype=np.uint8)
     pixels[:, 3] = 255
@@ -128,7 +138,7 @@ def _picture(values: Tensor, width: int) -> Pixels:
 
 
 def _bytes(values: Tensor) -> Tensor:
-    """[0, 1] to [0, 255]."""
+    """Quantize [0, 1] to [0, 255]."""
     return (values.clamp(0, 1) * 255).round().to(torch.uint8)
 
 
@@ -144,7 +154,10 @@ def _means(means: Tensor, width: int, pictures: dict[str, Pixels]) -> dict[str, 
 
 
 def _smallest_three(quaternions: Tensor) -> Tensor:
-    """[N, 4] (w, x, y, z) as three components and which one was left out, the largest, made positive."""
+    """Encode quaternions [N, 4] (w, x, y, z) as the three smallest components and the index of the largest.
+
+    The largest component is made positive.
+    """
     unit = torch.nn.functional.normalize(quaternions.double(), dim=1)
     largest = unit.abs().argmax(dim=1, keepdim=True)
     unit = torch.where(unit.gather(1, largest) < 0, -unit, unit)
@@ -156,14 +169,18 @@ def _smallest_three(quaternions: Tensor) -> Tensor:
 def _coded(
     name: str, values: Tensor, alpha: Tensor | None, width: int, pictures: dict[str, Pixels]
 ) -> dict[str, Any]:
-    """Values [N, 3] by a common code, and alpha [N, 1] beside."""
+    """Encode values [N, 3] with one codebook, with an optional alpha [N, 1]."""
     codes, book = _codebook(values)
     pictures[name] = _picture(codes if alpha is None else torch.cat((codes, alpha), dim=1), width)
     return {"codebook": book.tolist(), "files": [name]}
 
 
 def _codebook(values: Tensor) -> tuple[Tensor, Tensor]:
-    """Codes of the same shape, and the 256 values that they stand for, ascending (Lloyd's algorithm from quantiles)."""
+    """Quantize values to 256 levels with Lloyd's algorithm.
+
+    Returns:
+        The codes, with the shape of the values, and the ascending levels.
+    """
     flat = values.double().flatten()
     ranks = (torch.arange(CODES, dtype=torch.float64) + 0.5) / CODES * len(flat)
     book = flat.sort().values[ranks.long().clamp(max=len(flat) - 1)]
@@ -177,7 +194,7 @@ def _codebook(values: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _harmonics(rest: Tensor, width: int, pictures: dict[str, Pixels]) -> dict[str, Any]:
-    """A palette of the harmonics [N, 15, 3], and each Gaussian's place in it."""
+    """Encode harmonics [N, 15, 3] as indices into a palette."""
     count, coefficients, _ = rest.shape
     size = min(LARGEST_PALETTE, count, 1024 * 2 ** max(0, int(math.log2(max(count, 1024) / 1024))))
     labels, palette = _clusters(rest.flatten(1), size)
@@ -198,7 +215,7 @@ def _harmonics(rest: Tensor, width: int, pictures: dict[str, Pixels]) -> dict[st
 
 
 def _clusters(points: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """Which of ``count`` means each point [N, D] belongs to, [N] int64, and the means (Lloyd's algorithm)."""
+    """Cluster points [N, D] with Lloyd's algorithm, and return the cluster [N] int64 of each point and the means."""
     generator = torch.Generator().manual_seed(SEED)
     means = points[torch.randperm(len(points), generator=generator)[:count]].clone()
     for _ in range(ROUNDS):
@@ -215,7 +232,49 @@ def _nearest(points: Tensor, means: Tensor) -> Tensor:
 
 
 def _morton_order(means: Tensor) -> Tensor:
-    """Indices that put neighbors in space side by side, so that the pictures compress."""
-    # Ranks, not places: far Gaussians would squeeze all others into one cell.
+    """Return the indices of points in Morton order. Neighbors in space then compress well."""
+    # Ranks instead of positions: distant Gaussians would compress all others into one cell.
     ranks = means.argsort(dim=0).argsort(dim=0)
     return curve_places((ranks * 1024) // max(1, len(means))).argsort(stable=True)
+
+
+EXTENSION = "KHR_gaussian_splatting"
+Encoding = Literal["srgb", "linear"]
+COLOR_SPACES: dict[Encoding, str] = {"srgb": "srgb_rec709_display", "linear": "lin_rec709_display"}
+"""Value of ``colorSpace`` by encoding.
+
+Babylon and PlayCanvas blend encoded colors; three.js blends linear colors.
+"""
+
+
+def write_splat_glb(path: Path, ply: Path, asset: dict[str, Any], encoding: Encoding) -> None:
+    """Convert a PLY of Gaussians (+y up) without our own fields.
+
+    Args:
+        path: the file to write. ply: file from ``write_run_ply``. asset: glTF asset record.
+        encoding: encoding of the colors in the PLY.
+
+    Raises:
+        PolarguideError: the file cannot be written.
+    """
+    gaussians = read_ply(ply)
+    fields = {
+        "ROTATION": torch.nn.functional.normalize(gaussians["quaternions"], dim=1)[:, [1, 2, 3, 0]],
+        "SCALE": gaussians["log_scales"].exp(),
+        "OPACITY": torch.sigmoid(gaussians["opacity_logits"]),
+    }
+    harmonics = torch.cat((gaussians["sh_dc"], gaussians["sh_rest"]), dim=1)
+    for degree in range(4):
+        for k in range(2 * degree + 1):
+            fields[f"SH_DEGREE_{degree}_COEF_{k}"] = harmonics[:, degree * degree + k]
+    binary = Binary()
+    attributes = {"POSITION": binary.array(gaussians["means"].numpy(), bounds=True)}
+    attributes |= {f"{EXTENSION}:{name}": binary.array(values.numpy()) for name, values in fields.items()}
+    about = {
+        "kernel": "ellipse",
+        "colorSpace": COLOR_SPACES[encoding],
+        "projection": "perspective",
+        "sortingMethod": "cameraDistance",
+    }
+    primitive = {"mode": 0, "attributes": attributes, "extensions": {EXTENSION: about}}
+    binary.write(path, asset, primitive, {"extensionsUsed": [EXTENSION]})

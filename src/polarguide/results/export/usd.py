@@ -1,4 +1,7 @@
-"""Models and splats as USDZ packages: +y up, with ``metersPerUnit``, since without it a unit is a centimeter."""
+"""Export of models and splats as USDZ packages, +y up, with an explicit ``metersPerUnit``.
+
+The default unit of USD is the centimeter.
+"""
 
 from __future__ import annotations
 
@@ -18,11 +21,11 @@ WHAT = "a USDZ package"
 
 
 def write_usdz(path: Path, model: Textured, about: dict[str, Any], *, jpeg: bool) -> None:
-    """Write a textured mesh with a UsdPreviewSurface; unlit, its color is emitted.
+    """Write a textured mesh with a UsdPreviewSurface. An unlit mesh emits its color.
 
     Args:
-        path: the file. model: upright (+y). about: whom and what made it, in the stage's own data.
-        jpeg: whether base color, roughness and metalness are JPEG; else PNG.
+        path: the file. model: the mesh, +y up. about: custom data of the stage.
+        jpeg: encode base color, roughness and metalness as JPEG instead of PNG.
 
     Raises:
         PolarguideError: usd-core is not installed, or the file cannot be written.
@@ -42,7 +45,7 @@ def write_usdz(path: Path, model: Textured, about: dict[str, Any], *, jpeg: bool
         mesh.SetNormalsInterpolation("vertex")
         mesh.CreateSubdivisionSchemeAttr("none")
         uv = model.uv.astype("f4")
-        uv[:, 1] = 1 - uv[:, 1]  # v counts from the last row
+        uv[:, 1] = 1 - uv[:, 1]  # In USD v starts at the last row.
         coordinates = geom.PrimvarsAPI(mesh).CreatePrimvar("st", sdf.ValueTypeNames.TexCoord2fArray, "vertex")
         coordinates.Set(vt.Vec2fArray.FromNumpy(uv))
         _bind(stage, mesh, model, folder, jpeg=jpeg)
@@ -51,29 +54,34 @@ def write_usdz(path: Path, model: Textured, about: dict[str, Any], *, jpeg: bool
 
 
 def _bind(stage: Any, mesh: Any, model: Textured, folder: Path, *, jpeg: bool) -> None:
-    """The material of a mesh, with its textures as files in the folder."""
     shade = _module("UsdShade")
     types = _module("Sdf").ValueTypeNames
     material = shade.Material.Define(stage, f"{ROOT}/material")
 
     def shader(name: str, kind: str, **inputs: tuple[Any, Any]) -> Any:
-        made = shade.Shader.Define(stage, f"{ROOT}/material/{name}")
-        made.CreateIdAttr(kind)
+        node = shade.Shader.Define(stage, f"{ROOT}/material/{name}")
+        node.CreateIdAttr(kind)
         for key, (type_name, value) in inputs.items():
-            made.CreateInput(key, type_name).Set(value)
-        return made
+            node.CreateInput(key, type_name).Set(value)
+        return node
 
     def texture(name: str, pixels: Any, space: str) -> Any:
         kind, data = encoded(pixels, jpeg=jpeg)
         file = f"{name}.{'jpg' if kind.endswith('jpeg') else 'png'}"
         (folder / file).write_bytes(data)
         clamp = (types.Token, "clamp")
-        made = shader(name, "UsdUVTexture", file=(types.Asset, f"./{file}"), sourceColorSpace=(types.Token, space),
-                      wrapS=clamp, wrapT=clamp)  # fmt: skip
-        made.CreateInput("st", types.Float2).ConnectToSource(places.CreateOutput("result", types.Float2))
-        return made
+        node = shader(
+            name,
+            "UsdUVTexture",
+            file=(types.Asset, f"./{file}"),
+            sourceColorSpace=(types.Token, space),
+            wrapS=clamp,
+            wrapT=clamp,
+        )
+        node.CreateInput("st", types.Float2).ConnectToSource(coordinates.CreateOutput("result", types.Float2))
+        return node
 
-    places = shader("st", "UsdPrimvarReader_float2", varname=(types.String, "st"))
+    coordinates = shader("st", "UsdPrimvarReader_float2", varname=(types.String, "st"))
     surface = shader("surface", "UsdPreviewSurface", ior=(types.Float, model.index))
     color = texture("color", model.base_color, "sRGB").CreateOutput("rgb", types.Float3)
     if model.surface is None:
@@ -90,13 +98,13 @@ def _bind(stage: Any, mesh: Any, model: Textured, folder: Path, *, jpeg: bool) -
 
 
 def write_splat_usdz(path: Path, ply: Path, about: dict[str, Any]) -> None:
-    """Write splats as a ``ParticleField3DGaussianSplat``; our own fields are left out.
+    """Write splats as a ``ParticleField3DGaussianSplat`` without our own fields.
 
     Args:
-        path: the file. ply: as ``write_run_ply`` writes it, upright (+y). about: whom and what made it.
+        path: the file. ply: file from ``write_run_ply``, +y up. about: custom data of the stage.
 
     Raises:
-        PolarguideError: usd-core is not installed or knows no splats, or the file cannot be written.
+        PolarguideError: usd-core is missing or does not support splats, or the file cannot be written.
     """
     vt = _module("Vt")
     kind = getattr(_module("UsdVol"), "ParticleField3DGaussianSplat", None)
@@ -104,14 +112,13 @@ def write_splat_usdz(path: Path, ply: Path, about: dict[str, Any]) -> None:
         raise PolarguideError(
             "usd-core",
             expected="a version with ParticleField3DGaussianSplat",
-            found="an older one",
-            remedy="pip install -U usd-core.",
+            found="an older version",
+            remedy="Run pip install -U usd-core.",
         )
     gaussians = read_ply(ply)
     harmonics = torch.cat((gaussians["sh_dc"], gaussians["sh_rest"]), dim=1).reshape(-1, 3)
-    turns = torch.nn.functional.normalize(gaussians["quaternions"], dim=1)[
-        :, [1, 2, 3, 0]
-    ]  # as USD stores them
+    # USD stores the real part last.
+    quaternions = torch.nn.functional.normalize(gaussians["quaternions"], dim=1)[:, [1, 2, 3, 0]]
     scales = gaussians["log_scales"].exp()
     reach = 3 * scales.amax(dim=1, keepdim=True)
     corners = torch.stack(
@@ -128,7 +135,7 @@ def write_splat_usdz(path: Path, ply: Path, about: dict[str, Any]) -> None:
         }
         for name, values in vectors.items():
             getattr(field, f"Create{name}Attr")(vt.Vec3fArray.FromNumpy(values.numpy()))
-        field.CreateOrientationsAttr(vt.QuatfArray.FromNumpy(turns.contiguous().numpy()))
+        field.CreateOrientationsAttr(vt.QuatfArray.FromNumpy(quaternions.contiguous().numpy()))
         field.CreateOpacitiesAttr(vt.FloatArray.FromNumpy(torch.sigmoid(gaussians["opacity_logits"]).numpy()))
         field.CreateRadianceSphericalHarmonicsDegreeAttr(3)
 
@@ -140,7 +147,7 @@ def _module(name: str) -> Any:
 
 
 def _package(path: Path, about: dict[str, Any], fill: Callable[[Any, Path], None]) -> None:
-    """Write a stage, filled by a function that may put textures beside it, as one package."""
+    """Write a stage as a package. The function ``fill`` adds its content and may write textures into the folder."""
     usd, geom, utils, sdf = (_module(name) for name in ("Usd", "UsdGeom", "UsdUtils", "Sdf"))
     with temporary_folder(path.with_suffix(".parts")) as folder:
         stage = usd.Stage.CreateNew(str(folder / "model.usdc"))
@@ -150,9 +157,9 @@ def _package(path: Path, about: dict[str, Any], fill: Callable[[Any, Path], None
         stage.GetRootLayer().customLayerData = about
         fill(stage, folder)
         stage.Save()
-        whole = folder / "whole.usdz"
-        if not utils.CreateNewUsdzPackage(sdf.AssetPath(str(folder / "model.usdc")), str(whole)):
+        package = folder / "package.usdz"
+        if not utils.CreateNewUsdzPackage(sdf.AssetPath(str(folder / "model.usdc")), str(package)):
             raise PolarguideError(
-                path, expected="a USDZ package", found="none", remedy="Make room on the disk."
+                path, expected="a USDZ package", found="none", remedy="Free space on the disk."
             )
-        write_whole(path, whole.read_bytes())
+        write_whole(path, package.read_bytes())

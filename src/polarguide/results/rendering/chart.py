@@ -1,9 +1,9 @@
-"""A color chart in a photograph: 24 patches, and the matrix from the camera's linear RGB to linear sRGB that they give.
+"""Color chart in a photograph: 24 patches, and a matrix from the camera's linear RGB to linear sRGB.
 
-The chart is that of McCamy, Marcus and Davidson (1976), "A color-rendition chart". ``LAB`` are its maker's values for
-charts made since the end of 2014 (X-Rite, "New color specifications for ColorChecker SG and Classic Charts"): CIELAB
-under D50, by rows from dark skin to black. The matrix is the one of least squared distances in CIELAB; its error is
-stated as CIEDE2000 of each patch by the matrix that the others give.
+The chart is defined by McCamy, Marcus and Davidson (1976), "A color-rendition chart". ``LAB`` are its
+manufacturer's values for charts since the end of 2014 (X-Rite, "New color specifications for ColorChecker SG
+and Classic Charts"): CIELAB under D50, by rows from dark skin to black. The matrix minimizes squared
+distances in CIELAB. Its error is the CIEDE2000 of each patch with the matrix of the other patches.
 """
 
 from __future__ import annotations
@@ -67,18 +67,18 @@ def chart_of(view: View, corners: Sequence[float]) -> Chart:
     if int(used.sum()) < LEAST_PATCHES:
         raise PolarguideError(
             "chart",
-            expected=f"{LEAST_PATCHES} of {len(LAB)} patches of {LEAST_PIXELS} pixels, none of them clipped",
+            expected=f"{LEAST_PATCHES} of {len(LAB)} patches with {LEAST_PIXELS} pixels and without clipping",
             found=f"{int(used.sum())} in {view.name}",
-            remedy="Take a photograph of less exposure or from nearer, or correct the corners.",
+            remedy="Take a closer or darker photograph, or correct the corners.",
         )
     matrix = _fitted(colors[used], used)
     errors = _left_out(colors, used)
     if not errors.mean() <= WORST_FIT:
         raise PolarguideError(
             "chart",
-            expected=f"patches that one matrix brings within a mean CIEDE2000 of {WORST_FIT:g}",
+            expected=f"patches that one matrix fits with a mean CIEDE2000 of at most {WORST_FIT:g}",
             found=f"{errors.mean():.1f}, up to {errors.max():.1f}, in {view.name}",
-            remedy="Give the centers of the four corner patches, around the chart, under even light.",
+            remedy="Enter the centers of the four corner patches, around the chart, under even light.",
         )
     red, green, blue = ((float(a), float(b), float(c)) for a, b, c in matrix)
     return Chart((red, green, blue), float(errors.mean()), float(errors.max()), int(used.sum()), view.name)
@@ -102,9 +102,9 @@ def _patches(view: View, quad: Floats) -> Floats:
     inside &= ((nearest >= 0) & (nearest < (COLUMNS, ROWS))).all(axis=-1)
     index = (nearest[..., 1] * COLUMNS + nearest[..., 0])[inside].astype(int)
     counts = np.bincount(index, minlength=len(LAB))
-    whole = (counts >= LEAST_PIXELS) & (np.bincount(index, bad[inside], len(LAB)) == 0)
+    valid = (counts >= LEAST_PIXELS) & (np.bincount(index, bad[inside], len(LAB)) == 0)
     sums = np.stack([np.bincount(index, picture[inside][:, c], len(LAB)) for c in range(3)], axis=1)
-    return np.where(whole[:, None], sums / np.maximum(counts, 1)[:, None], np.nan)
+    return np.where(valid[:, None], sums / np.maximum(counts, 1)[:, None], np.nan)
 
 
 def _linear(colors: Floats, used: NDArray[np.bool_]) -> Floats:

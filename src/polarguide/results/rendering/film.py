@@ -23,8 +23,7 @@ from polarguide.results.rendering.subject import part_shown, subject_of
 from polarguide.runs.opened import OpenedRun, checked_layers
 from polarguide.shading.result import POLARIZED
 from polarguide.visualization import figures
-from polarguide.visualization.figures import Picture
-from polarguide.visualization.layers import layer_picture
+from polarguide.visualization.figures import Picture, layer_picture
 
 
 def write_video(path: Path, pictures: Iterable[Picture], *, frames_per_second: float) -> int:
@@ -59,24 +58,24 @@ def write_video(path: Path, pictures: Iterable[Picture], *, frames_per_second: f
                 count += 1
             if writer is not None:
                 writer.close()
-                _require_whole(encoder, named, count)
+                _require_complete(encoder, named, count)
             named.replace(temporary)
         except (OSError, RuntimeError) as error:
             raise PolarguideError(
                 path,
-                expected="that the video can be encoded",
-                found=str(error).strip().splitlines()[-1][:200] if str(error).strip() else "a failure",
-                remedy="Make room, choose another place or fewer layers.",
+                expected="a video file",
+                found=(str(error).strip() or "a failure").splitlines()[-1][:200],
+                remedy="Free space on the disk, choose another folder, or reduce the layers.",
             ) from None
         finally:
             if writer is not None:
                 with contextlib.suppress(OSError, RuntimeError):
-                    writer.close()  # the encoder would continue to write the unlinked file
+                    writer.close()  # Otherwise the encoder would continue to write the unlinked file.
             named.unlink(missing_ok=True)
     return count
 
 
-def _require_whole(encoder: Any, path: Path, count: int) -> None:
+def _require_complete(encoder: Any, path: Path, count: int) -> None:
     """Check the number of frames of a video. The encoder is another program, and does not report a full disk.
 
     Raises:
@@ -87,13 +86,13 @@ def _require_whole(encoder: Any, path: Path, count: int) -> None:
     except RuntimeError:  # the file cannot be read
         frames = 0
     if frames != count:
-        raise OSError(f"a file of {frames} of {count} pictures, as on a full disk")
+        raise OSError(f"a file with {frames} of {count} pictures; the disk may be full")
 
 
 SWINGS = {"orbit": 0.0, "spiral": 0.25}
 """Vertical amplitude of paths around the scene, in units of the cameras' distance."""
 FILLED = 0.9
-"""Share of the subject's Gaussians, the innermost, that every picture of a turntable contains."""
+"""Share of the subject's Gaussians, nearest to its center, that every picture of a turntable contains."""
 FRAMES_PER_SECOND = 30.0
 RENDERED = 160
 """Least number of bytes per pixel during rendering."""
@@ -106,7 +105,7 @@ def path_cameras(
 
     Args:
         run: the run whose cameras define the path.
-        path: ``orbit``, ``turntable`` (around the subject, so near that it fills the picture), ``spiral``,
+        path: ``orbit``, ``turntable`` (around the subject, which fills the picture), ``spiral``,
             ``interpolate``, or a JSON file of cameras.
         frames: number of cameras, except of a file.
         size: width and height of the pictures, except of a file; None: those of the photographs.
@@ -127,9 +126,9 @@ def path_cameras(
     if size is not None:
         raise PolarguideError(
             "size",
-            expected="a path that has no sizes of its own",
+            expected="a path without its own picture sizes",
             found=f"the file {path}",
-            remedy="Give its cameras the width and height.",
+            remedy="Set the width and height of its cameras.",
         )
     return read_path(Path(path))
 
@@ -174,7 +173,7 @@ def write_film(
     out = Path(out)
     names = checked_layers(list(layers))
     refuse_scene(out if out.suffix.lower() != ".mp4" else out.parent)
-    if out.parent == run.folder:  # somebody else may have made the run's folder
+    if out.parent == run.folder:  # The run may come from another user.
         require_inside(run.folder, out)
     tile = None if size is None else (size[0] // len(names), size[1])
     cameras, speed = path_cameras(run, path, frames, tile)
@@ -184,17 +183,17 @@ def write_film(
             "path",
             expected="cameras of one size",
             found=", ".join(f"{width}x{height}" for width, height in sizes[:4]),
-            remedy="Give all the same width and height.",
+            remedy="Set the same width and height for all cameras.",
         )
     width, height = sizes[0]
     require_memory(
         Path(path),
         RENDERED * width * height,
         f"pictures of {width}x{height}",
-        remedy="Give the cameras of the path a smaller width and height.",
+        remedy="Reduce the width and height of the cameras of the path.",
     )
     pictures = _pictures(run, names, cameras, reporter, named=out.suffix.lower() == ".mp4" and len(names) > 1)
-    if size is not None:  # the remainder of the width is black
+    if size is not None:  # The remainder of the width is black.
         rest = size[0] % len(names)
         pictures = (np.pad(picture, ((0, 0), (0, rest), (0, 0))) for picture in pictures)
     if out.suffix.lower() == ".mp4":

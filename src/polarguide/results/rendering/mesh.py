@@ -1,6 +1,7 @@
-"""A trained scene as a triangle mesh with its learned normals and diffuse colors.
+"""Triangle mesh of a scene with learned normals and diffuse colors.
 
-Depth maps are fused to a truncated signed distance field (Curless and Levoy 1996), whose zero set is the surface.
+Depth maps are fused to a truncated signed distance field (Curless and Levoy 1996). Its zero set is the
+surface.
 """
 
 from __future__ import annotations
@@ -21,19 +22,24 @@ from polarguide.geometry.scene_frame import scene_frame
 from polarguide.geometry.vectors import dot, unit
 from polarguide.shading.result import RenderResult
 
-TRUNCATION = 4.0  # number of voxels
-_SLAB = 1 << 21  # number of voxels per batch
+TRUNCATION = 4.0
+"""Truncation of the distance field, in voxels."""
+_BATCH = 1 << 21  # voxels
 _BOX_POINTS = 1 << 20
-"""Points of all views together that the box is found from, about; all of a large capture would take gigabytes."""
+"""Approximate number of points of all views for the bounding box, which limits the memory."""
 
 
 class NoSurfaceError(PolarguideError):
-    """There is nothing that several views see."""
+    """Error for a scene without a surface that several views see."""
 
 
 @dataclass(frozen=True, eq=False)
 class Box:
-    """A grid of voxels: ``low`` [3] is its corner, ``size`` a voxel's side, ``counts`` how many there are each way."""
+    """Grid of voxels.
+
+    Attributes:
+        low: [3] corner. size: side of a voxel. counts: number of voxels per axis.
+    """
 
     low: Tensor
     size: float
@@ -70,7 +76,7 @@ def box_around(points: Sequence[Tensor], center: Tensor, reach: float, resolutio
     near = torch.cat([p[(p - center).norm(dim=1) < reach] for p in points])
     if len(near) < 100:
         raise NoSurfaceError(
-            "mesh", expected="surfaces before the cameras", found="none", remedy="Train for more steps."
+            "mesh", expected="surfaces in front of the cameras", found="none", remedy="Train for more steps."
         )
     values = near.numpy()
     low = np.quantile(values, 0.005, axis=0)
@@ -90,14 +96,13 @@ def fuse(box: Box, views: Iterable[tuple[Camera, Tensor, Tensor]]) -> tuple[Tens
         views: camera, camera depth [H, W], and valid pixels [H, W] bool.
 
     Returns:
-        The mean distance in truncations, in [-1, 1], positive in front of the surface; and the number of views that
-        saw
-        each voxel. Both have the grid's shape, float32.
+        The mean distance relative to the truncation, in [-1, 1], positive in front of the surface; and the
+        number of views of each voxel. Both have the grid's shape, float32.
     """
     total = torch.zeros(box.counts)
     weight = torch.zeros(box.counts)
     nx, ny, nz = box.counts
-    step = max(1, _SLAB // (ny * nz))
+    step = max(1, _BATCH // (ny * nz))
     axes = [box.low[k] + box.size * (torch.arange(n) + 0.5) for k, n in enumerate(box.counts)]
     for camera, depth, mask in views:
         depths = torch.where(mask, depth, torch.zeros_like(depth)).flatten()
@@ -127,7 +132,7 @@ def fuse(box: Box, views: Iterable[tuple[Camera, Tensor, Tensor]]) -> tuple[Tens
 
 
 LEAST_VIEWS = 2
-"""Least number of views that must have seen a voxel."""
+"""Minimum number of views of a voxel."""
 SMALLEST_PIECE = 0.01
 """Share of the largest piece's faces below which pieces are dropped."""
 
@@ -166,17 +171,23 @@ def largest_pieces(surface: Surface, smallest: float) -> Surface:
 
 def large_faces(surface: Surface, smallest: float) -> NDArray[np.int64]:
     """Return the faces [F, 3] of these pieces."""
-    count = len(surface.vertices)
-    ends = surface.faces[:, [0, 1, 1, 2]].reshape(-1, 2)
-    graph = coo_matrix((np.ones(len(ends), dtype=np.int8), (ends[:, 0], ends[:, 1])), shape=(count, count))
-    _, piece = connected_components(graph, directed=False)
-    sizes = np.bincount(piece[surface.faces[:, 0]], minlength=int(piece.max()) + 1)
-    return surface.faces[sizes[piece[surface.faces[:, 0]]] >= smallest * sizes.max()]
+    piece = face_pieces(surface.faces)
+    sizes = np.bincount(piece)
+    return surface.faces[sizes[piece] >= smallest * sizes.max()]
+
+
+def face_pieces(faces: NDArray[np.int64]) -> NDArray[np.int32]:
+    """Return the index [F] of the connected piece of each face [F, 3]."""
+    ends = faces[:, [0, 1, 1, 2]].reshape(-1, 2)
+    shape = (int(faces.max()) + 1,) * 2
+    graph = coo_matrix((np.ones(len(ends), dtype=np.int8), (ends[:, 0], ends[:, 1])), shape=shape)
+    return np.asarray(connected_components(graph, directed=False)[1][faces[:, 0]])
 
 
 RESOLUTION = 192
 """Default number of voxels along the longest side."""
 OPAQUE = 0.8
+"""Minimum alpha of pixels with a valid depth."""
 COARSE = 64
 """Number of voxels along the sides of the box in which a field's surface is searched."""
 # Least cosine of the viewing angle of pixels with a valid depth.
@@ -191,15 +202,15 @@ class ColoredMesh:
     colors: NDArray[np.float64]
 
     def within(self, vertices: NDArray[np.bool_]) -> ColoredMesh:
-        """Return the faces whose vertices are all kept, [V] bool, without the small pieces that the cut leaves.
+        """Return the faces whose vertices are all in a mask [V] bool, without the small pieces of the cut.
 
         Raises:
-            PolarguideError: there are none.
+            PolarguideError: no face is left.
         """
         faces = self.surface.faces[vertices[self.surface.faces].all(axis=1)]
         if not len(faces):
             raise PolarguideError(
-                "the crop box", expected="a surface in it", found="none", remedy="Make it larger, or move it."
+                "the crop box", expected="a surface inside", found="none", remedy="Enlarge or move the box."
             )
         surface, used = self.surface.with_faces(faces)
         large, kept = surface.with_faces(large_faces(surface, SMALLEST_PIECE))
@@ -264,7 +275,7 @@ def _depth_samples(result: RenderResult, camera: Camera) -> DepthSamples:
 
 
 def painted(surface: Surface, views: list[tuple[Camera, DepthSamples]], box: Box) -> ColoredMesh:
-    """Return a mesh with colors and normals averaged over the views of each vertex, weighted by the viewing angle."""
+    """Average colors and normals over the views of each vertex, weighted by the cosine of the viewing angle."""
     vertices = torch.from_numpy(surface.vertices)
     own = torch.from_numpy(surface.normals)
     color = torch.zeros_like(vertices)

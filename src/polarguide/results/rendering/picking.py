@@ -15,10 +15,10 @@ from polarguide.geometry.camera import Camera
 from polarguide.geometry.vectors import unit
 from polarguide.shading.result import RenderResult
 
-SEEN = 0.5  # alpha of a surface
+LEAST_ALPHA = 0.5  # of a surface
 LEAST_GAIN = 0.02
 MOST_GAIN = 50.0
-# limits of a color that may be picked as white
+# Limits of a picked white.
 DARKEST = 2e-3
 BRIGHTEST = 0.98
 PATCH = 2  # radius in pixels over which a picked color is averaged
@@ -52,7 +52,7 @@ def surface_at(result: RenderResult, camera: Camera, x: float, y: float) -> Surf
     column = int(x)
     row = int(y)
     depth = float(result.depth[row, column])
-    if float(result.alpha[row, column]) < SEEN or depth <= 0:
+    if float(result.alpha[row, column]) < LEAST_ALPHA or depth <= 0:
         return None
     local = torch.tensor([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, 1.0], dtype=torch.float64)
     ray = camera.rotation.T @ local
@@ -86,15 +86,14 @@ def photograph_color(view: View, x: float, y: float) -> Tensor:
     if not bool(valid.any()):
         raise PolarguideError(
             "white_balance",
-            expected="pixels that are neither saturated nor invalid",
+            expected="pixels that are not saturated or invalid",
             found=f"none around {x:g},{y:g} of {view.name}",
-            remedy="Pick a place that is gray or white, but not too bright.",
+            remedy="Pick a gray or white place that is not too bright.",
         )
     return _patch(view.photograph(), row, column)[valid].mean(dim=0)
 
 
 def _patch(picture: Tensor, row: int, column: int) -> Tensor:
-    """Return the pixels [h, w, ...] around a pixel."""
     top = max(0, row - PATCH)
     left = max(0, column - PATCH)
     return picture[top : row + PATCH + 1, left : column + PATCH + 1]
@@ -111,9 +110,9 @@ def white_balance_gains(color: Tensor) -> Vector:
         listed = ", ".join(f"{value:.3g}" for value in values)
         raise PolarguideError(
             "white_balance",
-            expected=f"a color of {DARKEST:g} to {BRIGHTEST:g} of full scale in its brightest channel, none of them 0",
+            expected=f"a color of {DARKEST:g} to {BRIGHTEST:g} of full scale in its brightest channel, without zeros",
             found=f"R, G, B {listed}",
-            remedy="Pick a place that is gray or white, neither dark nor clipped.",
+            remedy="Pick a gray or white place that is not dark or clipped.",
         )
     gains = [values[1] / value for value in values]
     if not all(LEAST_GAIN <= gain <= MOST_GAIN for gain in gains):
@@ -121,7 +120,7 @@ def white_balance_gains(color: Tensor) -> Vector:
             "white_balance",
             expected=f"gains of {LEAST_GAIN:g} to {MOST_GAIN:g}",
             found=", ".join(f"{gain:.3g}" for gain in gains),
-            remedy="Pick a place that is gray or white.",
+            remedy="Pick a gray or white place.",
         )
     return gains[0], 1.0, gains[2]
 

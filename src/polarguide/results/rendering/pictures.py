@@ -24,10 +24,10 @@ from polarguide.runs.model import Within
 from polarguide.runs.opened import OpenedRun, checked_layers
 from polarguide.shading.result import POLARIZED, RenderResult
 from polarguide.visualization import figures
-from polarguide.visualization.figures import contact_sheet
-from polarguide.visualization.layers import (
+from polarguide.visualization.figures import (
     Depths,
     Picture,
+    contact_sheet,
     depth_range,
     layer_picture,
     layer_scale,
@@ -43,9 +43,9 @@ _RADIANCE = "linear radiance, R G B; 1 is full scale of the photograph S0/2"
 UNITS = {
     **dict.fromkeys(("final", "base", "reflection", "specular", "diffuse"), _RADIANCE),
     "strength": "share of the reflection, 0 to 1",
-    "roughness": "square root of GGX's alpha, 0 to 1, as glTF has it; a mirror's is that of a texel of the light",
+    "roughness": "square root of GGX's alpha, 0 to 1, as in glTF; a mirror has the roughness of a texel of the light",
     "metalness": "share of metals, 0 to 1",
-    "normal": "world axes of the scene, x y z; blended, so up to length 1, and 0 where nothing is",
+    "normal": "world axes of the scene, x y z; blended, with length 0 to 1, and 0 for the background",
     "depth": "distance along the camera's axis, in the scene's units",
     "alpha": "coverage, 0 to 1",
     "stokes": "predicted; npy: [3, H, W, 3] S0, S1, S2 of R G B, exr: S0 S1 S2 of their mean as R G B; S0 is twice the "
@@ -68,7 +68,7 @@ def views_named(scene: Scene, choice: str) -> tuple[View, ...]:
     chosen = groups[choice] if choice in groups else tuple(scene.view(name) for name in names)
     if not chosen:
         raise PolarguideError(
-            "views", expected="at least one view", found="none", remedy="Name a view, or take train."
+            "views", expected="at least one view", found="none", remedy="Name a view, or choose train."
         )
     return chosen
 
@@ -89,13 +89,12 @@ def write_pictures(
         run: the run; its scene is read.
         out: folder to write; default: ``render`` in the run's folder.
         views: ``test``, ``train``, ``all``, or names separated by commas.
-        layers: names of layers; default: all of the run's. Layers that the recipe lacks are left out and reported.
-        format: png as a display shows layers, in the color of the run's presentation; exr and npy have linear
-            numbers, in
-            the units that ``layers.json`` states. The contact sheet is PNG.
-        transparent: whether PNG files have a transparent background. Their colors are not blended, so that no dark
-            rim
-            shows on another background. The contact sheet is opaque.
+        layers: names of layers; default: all of the run's. Layers that the recipe lacks are left out and
+            reported.
+        format: png shows layers like a display, in the color of the run's presentation. exr and npy contain
+            linear numbers in the units in ``layers.json``. The contact sheet is PNG.
+        transparent: write PNG files with a transparent background. Their colors are not blended with black,
+            so that they have no dark rim on another background. The contact sheet is opaque.
         reporter: receives the progress.
 
     Returns:
@@ -107,7 +106,7 @@ def write_pictures(
     check_choice("format", format, get_args(PictureFormat))
     if transparent and format != "png":
         raise PolarguideError(
-            "transparent", expected="format png", found=format, remedy="Leave one of the two out."
+            "transparent", expected="format png", found=format, remedy="Omit one of the two options."
         )
     folder = run.folder / "render" if out is None else Path(out)
     refuse_scene(folder)
@@ -126,30 +125,20 @@ def write_pictures(
     with reporter.track("rendering", len(chosen)) as advance:
         for number, view in enumerate(chosen):
             result = run.result(view.camera, polarized=polarized).to("cpu")
-            pictures = {
-                name: layer_picture(
-                    result, name, view.camera, depths, exposed=name == "reflection", color=color
-                )
-                for name in names
-            }
+            pictures = _layer_pictures(result, names, view, depths, color)
+            missing |= {*names} - pictures.keys()
             for name, picture in pictures.items():
-                if picture is None:
-                    missing.add(name)
-                elif format == "png" and transparent:
-                    rendered = _unblended(result)
-                    whole = layer_picture(
-                        rendered, name, view.camera, depths, exposed=name == "reflection", color=color
-                    )
-                    assert whole is not None
+                path = folder / f"{view.name}_{name}.{format}"
+                if format != "png":
+                    _write_numbers(path, result.layers[name])
+                elif transparent:
+                    colors = _layer_pictures(_unblended(result), [name], view, depths, color)[name]
                     alpha = (result.alpha.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
-                    figures.write_png(folder / f"{view.name}_{name}.png", whole, alpha, about)
-                elif format == "png":
-                    figures.write_png(folder / f"{view.name}_{name}.png", picture, about=about)
+                    figures.write_png(path, colors, alpha, about)
                 else:
-                    _write_numbers(folder / f"{view.name}_{name}.{format}", result.layers[name])
+                    figures.write_png(path, picture, about=about)
             if len(rows) < SHEET_VIEWS:
-                cells = {name: picture for name, picture in pictures.items() if picture is not None}
-                rows.append((view.name, cells | reference_pictures(view, color, depths)))
+                rows.append((view.name, pictures | reference_pictures(view, color, depths)))
             advance(number + 1)
     if format != "png":
         write_whole(
@@ -160,6 +149,17 @@ def write_pictures(
     if missing:
         reporter.say(f"this recipe has no layer {', '.join(sorted(missing))}")
     return sheet
+
+
+def _layer_pictures(
+    result: RenderResult, names: Sequence[str], view: View, depths: Depths | None, color: Tensor | None
+) -> dict[str, Picture]:
+    """Return the pictures of the layers that a rendering has, by name."""
+    pictures = {
+        name: layer_picture(result, name, view.camera, depths, exposed=name == "reflection", color=color)
+        for name in names
+    }
+    return {name: picture for name, picture in pictures.items() if picture is not None}
 
 
 def common_depths(run: OpenedRun, views: Sequence[View]) -> Depths:
@@ -196,21 +196,20 @@ def _sheet(
 ) -> Picture:
     """Return a contact sheet with a row for each view, and a legend below.
 
-    Columns that some view lacks are left out. Layers of one color in all views are left out as well, such as
-    metalness
-    without any metal; the caption names them.
+    Columns that some view lacks are left out. Layers of one color in all views, such as metalness without any
+    metal, are also left out, and the caption names them.
     """
     titles = [column for name in names for column in (name, true_name(name), f"{name}, measured")]
     columns = [column for column in titles if all(column in cells for _, cells in views)]
     # A difference of one level is rounding.
-    even = [
+    uniform = [
         column
         for column in columns
         if all(np.ptp(cells[column].reshape(-1, 3), axis=0).max() <= 1 for _, cells in views)
     ]
-    columns = [column for column in columns if column not in even] or columns
-    if even and columns != even:
-        caption = f"{caption}; left out, the same everywhere: {', '.join(even)}"
+    columns = [column for column in columns if column not in uniform] or columns
+    if uniform and columns != uniform:
+        caption = f"{caption}; left out as uniform: {', '.join(uniform)}"
     rows = [[cells[column] for column in columns] for _, cells in views]
     scales = [layer_scale(column, depths) for column in columns]
     return contact_sheet(rows, [name for name, _ in views], columns, footer=scales, caption=caption)

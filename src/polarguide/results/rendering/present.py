@@ -77,8 +77,7 @@ def present(
             it; or the folder of another scene or run with a chart. It replaces a white balance.
         exposure: exposure compensation in stops, -8 to 8, or ``none``.
         up_axis: ``none`` (the up axis of the cameras), an axis such as ``z`` or ``-y``, three numbers, or VIEW,X,Y: a
-            place
-            on a level surface, whose normal is up.
+            place on a level surface, whose normal is up.
         points: two PLACEs of known distance.
         distance: their distance, such as ``85mm``.
         meters_per_unit: length of one unit of the scene, or ``none``.
@@ -136,7 +135,7 @@ class _PresentedFolder:
 
     def __init__(self, folder: Path, device: DeviceName, reporter: Reporter) -> None:
         require_folder(
-            folder, expected="the folder of a scene or a run", remedy="Give what prepare or train wrote."
+            folder, expected="the folder of a scene or a run", remedy="Choose a folder from prepare or train."
         )
         self.folder = folder
         self._device = device
@@ -185,9 +184,9 @@ class _PresentedFolder:
             if getattr(above, name) not in NOTHING:
                 raise PolarguideError(
                     name,
-                    expected="a value of the run's own to remove",
-                    found=f"one of its scene's ({self._scene_folder / PRESENTATION_FILE})",
-                    remedy=f"Remove it there ({command('present', self._scene_folder)}), or give the run another.",
+                    expected="a value of the run itself",
+                    found=f"a value of its scene ({self._scene_folder / PRESENTATION_FILE})",
+                    remedy=f"Remove it there ({command('present', self._scene_folder)}), or set another for the run.",
                 )
 
     def pixel(self, text: str) -> tuple[str, float, float] | None:
@@ -207,9 +206,9 @@ class _PresentedFolder:
         if not self._is_run:
             raise PolarguideError(
                 where,
-                expected="a run, whose depth tells where the surface is",
+                expected="a run, whose depth locates the surface",
                 found=f"the scene {self.folder}",
-                remedy="Give the folder of a run of it, or numbers X,Y,Z.",
+                remedy="Use the folder of a run of this scene, or numbers X,Y,Z.",
             )
         camera = self.scene.view(name).camera
         hit = surface_at(self._run.result(camera, depth=True).to("cpu"), camera, x, y)
@@ -218,7 +217,7 @@ class _PresentedFolder:
                 where,
                 expected=f"a surface at a place in {name}, which is {camera.width} x {camera.height}",
                 found=f"none at {x:g},{y:g}",
-                remedy="Pick a place on an object; polarguide view shows where it is.",
+                remedy="Pick a place on an object in polarguide view.",
             )
         return hit.point, hit.normal
 
@@ -249,6 +248,7 @@ def _white_balance(text: str, place: _PresentedFolder) -> Vector | None:
 
 
 NOTHING = (None, "", False)
+"""Values that mean "not set"."""
 
 
 def _chart(text: str, place: _PresentedFolder) -> Chart:
@@ -274,7 +274,7 @@ def _up_axis(text: str, place: _PresentedFolder) -> Vector | None:
     if (pixel := place.pixel(text)) is not None:
         _, normal = place.surface(*pixel, "up_axis")
         if normal is None:
-            raise _wrong("up_axis", "a place whose normal is known", text)
+            raise _wrong("up_axis", "a place with a known normal", text)
         x, y, z = normal.tolist()
     else:
         expected = "none, an axis such as z or -y, three numbers, or VIEW,X,Y"
@@ -292,12 +292,12 @@ def _scale(
             return None
         return _require_numbers(meters_per_unit, 1, "meters_per_unit", "a number above 0, or none")[0]
     if len(points) != 2 or distance is None:
-        found = f"{len(points)} points and {'a' if distance else 'no'} distance"
-        raise _wrong("points", "two points, and their --distance", found)
+        count = f"{len(points)} points and {'a' if distance else 'no'} distance"
+        raise _wrong("points", "two points, and their --distance", count)
     meters = parse_length(distance)
     apart = float((place.point(points[0]) - place.point(points[1])).norm())
     if apart < 1e-9:
-        raise _wrong("points", "two points that lie apart", "one and the same")
+        raise _wrong("points", "two different points", "equal points")
     return meters / apart
 
 

@@ -33,18 +33,17 @@ def write_priors(
 ) -> Path:
     """Write pictures of a scene's polarization, one PNG each, and a contact sheet of them.
 
-    They are S0, DoLP, AoLP, zenith, both separations, polarization normals, normals from color differences, and the
-    mask of
-    usable pixels. The exact separation needs normals: those of a trained run, else the polarization normals
-    themselves,
-    whose ambiguity is then resolved only by the surface facing the camera.
+    The pictures show S0, DoLP, AoLP, zenith, both separations, polarization normals, normals from color
+    differences, and the mask of usable pixels. The exact separation needs normals: those of a trained run,
+    else the polarization normals. Without a run, their ambiguity is resolved only by the visibility of the
+    surface.
 
     Args:
         scene: a scene with poses.
         out: folder to write.
         run: a run trained on this scene at this size, whose normals resolve the ambiguity.
         views: ``test``, ``train``, ``all``, or names separated by commas.
-        refractive_index: refractive index of the surfaces; None: that of the scene.
+        refractive_index: refractive index of the surfaces; None for the scene's.
         threshold: DoLP above which a pixel's normal is used.
         reporter: receives the progress.
 
@@ -52,9 +51,8 @@ def write_priors(
         The path of the contact sheet.
 
     Raises:
-        PolarguideError: a view does not exist, its pictures do not determine its polarization, or the run was trained
-            at
-            another size.
+        PolarguideError: a view does not exist, its pictures do not determine its polarization, or the run was
+            trained at another size.
     """
     check_finite("threshold", threshold, 0.0, 1.0)
     index = index_of(refractive_index, scene.refractive_index)
@@ -62,9 +60,9 @@ def write_priors(
     if run is not None and run.configuration.downscale != scene.downscale:
         raise PolarguideError(
             "downscale",
-            expected=f"{run.configuration.downscale}, as {run.folder} was trained",
+            expected=f"{run.configuration.downscale}, the factor of {run.folder}",
             found=str(scene.downscale),
-            remedy="Give the same factor.",
+            remedy="Use the same factor.",
         )
     chosen = views_named(scene, views)
     for view in chosen:
@@ -130,10 +128,7 @@ def resolving_normals(
     """Return normals in camera axes that resolve the ambiguity, and the name of their source."""
     if run is not None:
         normal = run.result(view.name, depth=False).to("cpu").normal
-        assert normal is not None
         return guide_normals(view.camera.to_camera(normal), rays, Priors.minimum_normal)[0], "by_run"
     guess = torch.nn.functional.normalize(torch.tensor([0.0, -0.5, -1.0]).expand_as(rays), dim=-1)
-    chosen = optics.disambiguate(
-        optics.physical_candidates(luminance, rays, index), guess, rays, azimuth_weight=0.0
-    ).normal
-    return chosen, "by_polarization"
+    candidates = optics.physical_candidates(luminance, rays, index)
+    return optics.disambiguate(candidates, guess, rays, azimuth_weight=0.0).normal, "by_polarization"

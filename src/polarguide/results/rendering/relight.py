@@ -52,7 +52,7 @@ def relight(
         return
     what = "rotate_environment" if panorama is None else "environment"
     if not math.isfinite(degrees):
-        raise PolarguideError(what, expected="degrees", found=str(degrees), remedy="Give a number.")
+        raise PolarguideError(what, expected="finite degrees", found=str(degrees), remedy="Enter a number.")
     cubemap = needs_radiance(run.model.shading, what=what)
     light = run.model.light
     around = run.frame
@@ -81,8 +81,8 @@ def needs_radiance(shading: ShadingModel, *, what: str) -> RadianceCubemap:
     raise PolarguideError(
         what,
         expected="a recipe that learns the radiance of its surroundings",
-        found="one whose light is something else" if shading.reflects else "a run without reflection",
-        remedy="Take a run of 3dgs-dr, polarguide or polarguide-stokes.",
+        found="a recipe with another kind of light" if shading.reflects else "a run without reflection",
+        remedy="Choose a run of 3dgs-dr, polarguide or polarguide-stokes.",
     )
 
 
@@ -90,11 +90,9 @@ def needs_radiance(shading: ShadingModel, *, what: str) -> RadianceCubemap:
 def mirrored_light(run: OpenedRun, cubemap: RadianceCubemap, advance: Advance) -> Tensor:
     """Return raw texels [6, R, R, 3] of the learned light together with the local light of the Gaussians.
 
-    A texel is the mean of the light that all training views see mirrored from its direction, weighted by the square
-    of the
-    mirrored share: the least-squares fit to the specular layers. The learned light counts as one more pixel of a
-    surface
-    that mirrors with all of its strength, seen squarely.
+    A texel is the mean of the light that all training views see reflected from its direction, weighted by the
+    square of the reflected share. This is the least-squares fit to the specular layers. The learned light
+    counts as one additional pixel of a surface with full strength at normal incidence.
     """
     texels = run.light[cubemap.name].detach().cpu()
     shading = run.model.shading
@@ -103,14 +101,11 @@ def mirrored_light(run: OpenedRun, cubemap: RadianceCubemap, advance: Advance) -
     for count, view in enumerate(views, 1):
         result = run.result(view.camera).to("cpu")
         light = result.layers["reflection"]
-        share = (
-            (result.layers["specular"].sum(-1) / light.sum(-1).clamp(min=1e-6))
-            .clamp(0, 1)[..., None]
-            .square()
-        )
+        ratio = result.layers["specular"].sum(-1) / light.sum(-1).clamp(min=1e-6)
+        share = ratio.clamp(0, 1)[..., None].square()
         directions = mirrored(view.camera.world_rays(), unit(result.normal, 1e-3)).reshape(-1, 3)
         with torch.enable_grad():
-            # The gradient of a look-up distributes each pixel among the texels that it reads.
+            # The gradient of a look-up distributes a pixel among its texels.
             cubemap_lookup(sums, directions).backward(
                 torch.cat([share * light, share], dim=-1).reshape(-1, 4)
             )
@@ -183,8 +178,9 @@ def write_exr(path: Path, picture: Tensor, attributes: Mapping[str, str] = {}) -
 
 
 def write_hdr(path: Path, picture: Tensor) -> None:
-    """Write linear radiance [H, W, 3] as Radiance RGBE, which more programs read: 8 bits per channel, a common
-    exponent.
+    """Write linear radiance [H, W, 3] as Radiance RGBE, with 8 bits per channel and a common exponent.
+
+    More programs read this format than EXR.
     """
     pixels = np.ascontiguousarray(picture.detach().numpy().astype(np.float32)[..., ::-1])
     _, data = cv2.imencode(".hdr", pixels)
@@ -211,14 +207,14 @@ def read_panorama(path: Path) -> Tensor:
             path,
             expected="a panorama of linear radiance, .hdr or .exr, twice as wide as high",
             found=found,
-            remedy="Give an equirectangular picture.",
+            remedy="Choose an equirectangular picture.",
         )
     values = torch.tensor(pixels)
     missing = int(values.isnan().any(dim=-1).sum())
     if missing or not bool((values > 0).any()):
         raise PolarguideError(
             path,
-            expected="a finite value at every pixel, and one above 0",
+            expected="a finite value at every pixel, and at least one value above 0",
             found=f"NaN at {missing} of {values[..., 0].numel()} pixels" if missing else "no value above 0",
             remedy="Export the panorama again, or fill these pixels.",
         )

@@ -28,11 +28,11 @@ class Subject:
 
     Attributes:
         inside: selects the part; None: everything.
-        words: description of the part.
+        description: description of the part.
     """
 
     inside: Inside | None
-    words: str
+    description: str
 
     def holds(self, places: Tensor) -> Tensor:
         """Return which places [N, 3] belong to it, [N] bool on their device."""
@@ -40,28 +40,26 @@ class Subject:
             return torch.ones(len(places), dtype=torch.bool, device=places.device)
         return torch.from_numpy(self.inside(places.detach().cpu().numpy())).to(places.device)
 
-    def told(self, kept: int, total: int, run: OpenedRun) -> str:
-        """Return a line about the removed Gaussians and the remedy, or an empty text if none was removed."""
-        if kept == total:
-            return ""
-        return (
-            f"{kept:,} of {total:,} Gaussians: {self.words}. "
-            f"Everything: {command('present', run.folder, '--crop', 'all')}   "
-            f"a box: {command('view', run.folder)}, Crop"
-        )
+    def report_removed(self, inside: Tensor, run: OpenedRun, reporter: Reporter) -> None:
+        """Report the number of Gaussians [N] bool in the part, if some are outside, and the commands to change it."""
+        count = int(inside.sum())
+        if count < len(inside):
+            reporter.say(
+                f"{count:,} of {len(inside):,} Gaussians: {self.description}. "
+                f"Everything: {command('present', run.folder, '--crop', 'all')}   "
+                f"a box: {command('view', run.folder)}, Crop"
+            )
 
 
 def subject_of(run: OpenedRun, *, masked: bool = False) -> Subject:
-    """Return the subject: the crop box; else the foreground of the scene's masks; else the region that the cameras
-    see.
+    """Return the subject of a run: the crop box, the foreground of the masks, or the region that the cameras see.
 
-    The foreground is decided by the majority of the pictures that contain a place. The region contains the places
-    that are
-    in most of the pictures.
+    The first of these that exists is the subject. The foreground is decided by the majority of the pictures
+    that contain a place. The region contains the places that are in most of the pictures.
 
     Args:
         run: the run. The scene is read if it has masks, else only its poses.
-        masked: whether the subject must be in the masks as well if there is a crop box.
+        masked: the subject must be inside the masks even if there is a crop box.
 
     Raises:
         PolarguideError: ``masked`` is set and the scene has no masks, or the scene is missing.
@@ -82,33 +80,32 @@ def subject_of(run: OpenedRun, *, masked: bool = False) -> Subject:
             return np.asarray(crop.inside(torch.from_numpy(places), around).numpy())
 
         if not masked:
-            return Subject(boxed, "what lies in the crop box")
-        shown = _in_masks(run)
+            return Subject(boxed, "the content of the crop box")
+        in_masks = _in_masks(run)
         return Subject(
-            lambda places: boxed(places) & shown(places), "what lies in the crop box and the masks"
+            lambda places: boxed(places) & in_masks(places), "the content of the crop box and the masks"
         )
     if run.has_masks and (masked or not presentation.whole):
-        return Subject(_in_masks(run), "what most of the scene's masks show")
+        return Subject(_in_masks(run), "the foreground in most of the scene's masks")
     if presentation.whole:
         return Subject(None, "everything")
     everywhere = [(camera, None) for camera in run.poses.values()]
-    return Subject(_by_majority(everywhere), "what most of the cameras have in their pictures")
+    return Subject(_by_majority(everywhere), "the region in most of the pictures")
 
 
 def part_shown(run: OpenedRun, reporter: Reporter) -> Within:
-    """Return the part of a run that a film shows, as an argument of renderings.
+    """Return the part of a run in a film, as an argument of renderings.
 
     Args:
         run: the run.
-        reporter: receives the line about removed Gaussians.
+        reporter: receives a line about removed Gaussians.
 
     Raises:
         PolarguideError: the scene is missing.
     """
     subject = subject_of(run)
     inside = subject.holds(run.model.state.gaussians["means"])
-    if line := subject.told(int(inside.sum()), len(inside), run):
-        reporter.say(line)
+    subject.report_removed(inside, run, reporter)
     return lambda _: inside
 
 
@@ -129,9 +126,10 @@ def _by_majority(views: Sequence[tuple[Camera, Tensor | None]]) -> Inside:
         votes = torch.zeros(len(points))
         for camera, mask in views:
             pixel, _, in_picture = seen_at(points - camera.center, camera)
-            votes += torch.where(in_picture if mask is None else mask[pixel], 1.0, -1.0) * (
-                1.0 if mask is None else in_picture
-            )
+            if mask is None:
+                votes += torch.where(in_picture, 1.0, -1.0)
+            else:
+                votes += torch.where(mask[pixel], 1.0, -1.0) * in_picture
         return np.asarray((votes > 0).numpy())
 
     return inside

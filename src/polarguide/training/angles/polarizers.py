@@ -18,8 +18,7 @@ from torch import Tensor
 from polarguide import optics
 from polarguide.capture import Scene, View
 from polarguide.capture.angle_evidence import TO_DEVIATION, angle_difference, mean_angle, tolerance
-from polarguide.capture.exposures import Exposure
-from polarguide.capture.exposures import found as found_exposure
+from polarguide.capture.exposures import Exposure, with_estimate
 from polarguide.capture.view import ANGLES
 from polarguide.optics import Mount
 from polarguide.training.recipe import AngleRules, Recipe
@@ -464,4 +463,4 @@ def _belief(judgment: Judgment, common: float | None) -> Exposure:
     if not judgment.guesses:
         return specified
     gain = specified.gain if common is None else specified.gain * judgment.gain / common
-    return found_exposure(specified, judgment.angle, gain)
+    return with_estimate(specified, judgment.angle, gain)

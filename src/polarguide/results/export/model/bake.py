@@ -1,7 +1,7 @@
-"""Textures from a trained scene: every texel has the weighted mean of what the views show of its place.
+"""Textures of a scene: each texel is the weighted mean of its pixels in the views.
 
-A view counts where its own rendered surface lies at the texel's depth, so that nothing is painted with what stands
-before or behind it, and by the square of the cosine at which it looks.
+A view counts if its rendered surface lies at the texel's depth. So occluders and the background do not stain
+the texture. The weight is the squared cosine of the viewing angle.
 """
 
 from __future__ import annotations
@@ -19,40 +19,38 @@ from torch.nn.functional import grid_sample, max_pool2d
 
 from polarguide.capture import View
 from polarguide.core.progress import Reporter
-from polarguide.gaussians.gaussians import any_nonzero
 from polarguide.geometry.camera import Camera
 from polarguide.geometry.vectors import dot, unit
 from polarguide.raster.surface import WIDTH
 from polarguide.results.rendering.mesh import OPAQUE
 from polarguide.runs.model import GaussianModel
 from polarguide.runs.opened import OpenedRun
-from polarguide.shading.gbuffer import splats
-from polarguide.shading.metal import metal_channels, reflectance
 from polarguide.shading.result import RenderResult
 from polarguide.shading.surface import GltfTexture
 
 ColorSource = Literal["diffuse", "final", "photograph"]
+"""Layer that provides the base color."""
 STEEPEST = 0.15
-"""Cosine below which a view does not count: its pixels are stretched seven times over the surface."""
+"""Cosine of the viewing angle below which a view is ignored. Its pixels are stretched by a factor of seven."""
 NEAR = 2.0
-"""Voxels by which a texel may lie off the rendered depth, where it is seen squarely."""
+"""Maximum distance in voxels of a texel from the rendered depth, at perpendicular view."""
 SEEN = 0.05
-"""Sum of weights from which a texel counts as seen: one view at a cosine of 0.22."""
-_TOGETHER = 1 << 19
+"""Sum of weights above which a texel counts as seen: one view at a cosine of 0.22."""
+_BATCH = 1 << 19  # texels
 _FILLED_FROM = 200_000
-"""Seen texels among which the nearest one of an unseen texel is looked for, at most."""
+"""Maximum number of seen texels in the search for the nearest one."""
 
 
 @dataclass(frozen=True, eq=False)
 class Baked:
-    """Of M texels, single precision.
+    """Values of M texels, single precision.
 
     Attributes:
-        color: [M, 3] linear. roughness: [M] as glTF has it. metalness: [M]. strength: [M] of the reflection.
+        color: [M, 3] linear. roughness: [M] of glTF. metalness: [M]. strength: [M] of the reflection.
         reflectance: [M, 3] of metals at normal incidence. index: [M] refractive index.
-        normal: [M, 3] learned, not unit. seen: [M] bool, whether a view shows the texel.
-        nearest: [U] for each of the others the nearest texel in space that one does, whose values it has.
-        added: [M, C] values in [0, 1] of surface properties with a texture of their own.
+        normal: [M, 3] learned, not normalized. seen: [M] bool, texels that some view shows.
+        nearest: [U] index of the nearest seen texel of each other texel, whose values it has.
+        added: [M, C] values in [0, 1] of surface properties with their own texture.
     """
 
     color: NDArray[np.float32]
@@ -67,7 +65,7 @@ class Baked:
     added: Sequence[tuple[GltfTexture, NDArray[np.float32]]] = ()
 
     def filled(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Values [M, C] with those of unseen texels replaced."""
+        """Replace the values [M, C] of unseen texels by those of the nearest seen texels."""
         values = values.copy()
         values[~self.seen] = values[self.nearest]
         return values
@@ -82,9 +80,9 @@ CHANNELS = {
     "index": 1,
     "normal": 3,
 }
-"""Numbers of values of a texel. ``surface.SurfaceProperty`` rows with a texture follow."""
+"""Number of channels of each quantity. Rows of ``surface.SurfaceProperty`` with a texture follow."""
 CONSTANTS = {"roughness": 1.0, "metalness": 0.0, "strength": 0.0}
-"""Of recipes that learn nothing of the kind: a matte dielectric."""
+"""Values for recipes that do not learn them: a matte dielectric."""
 
 
 @torch.no_grad()
@@ -97,11 +95,11 @@ def bake(
     voxel: float,
     reporter: Reporter,
 ) -> Baked:
-    """Look up what views show at places on the surface.
+    """Sample the views at points of the surface.
 
     Args:
-        run: of Gaussians. views: that count. places, normals: [M, 3] in the scene, normals unit.
-        color: the layer, or the photographs. voxel: side of those that the surface was fused in.
+        run: the run. views: views to sample. places, normals: [M, 3] in the scene, unit normals.
+        color: the sampled layer or the photographs. voxel: side of a voxel of the fusion.
         reporter: receives progress.
     """
     model = run.model
@@ -118,8 +116,8 @@ def bake(
             layers |= {row.name: result.layers[row.name].view(*result.alpha.shape, -1) for row in added}
             picture = torch.cat([*layers.values()], dim=-1)
             depth = _reliable_depth(result, view if color == "photograph" else None)
-            for begin in range(0, len(points), _TOGETHER):
-                part = slice(begin, begin + _TOGETHER)
+            for begin in range(0, len(points), _BATCH):
+                part = slice(begin, begin + _BATCH)
                 rows, weight, pixels = _visible(points[part], facing[part], view.camera, depth, voxel)
                 sampled = grid_sample(picture.permute(2, 0, 1)[None], pixels[None, None], align_corners=False)
                 total[part].index_add_(0, rows, weight[:, None] * sampled[0, :, 0].T)
@@ -137,7 +135,7 @@ def bake(
 
 
 def _layers(model: GaussianModel, result: RenderResult, view: View, color: ColorSource) -> dict[str, Tensor]:
-    """Pictures [H, W, C] of the channels, in their order, of the surface alone: blended values over alpha."""
+    """Return pictures [H, W, C] of the channels in their order, for the surface alone: blended values over alpha."""
     alpha = result.alpha.clamp(min=0.05)[..., None]
     size = result.alpha.shape
     if color == "photograph":
@@ -151,30 +149,22 @@ def _layers(model: GaussianModel, result: RenderResult, view: View, color: Color
         values = result.layers.get(name)
         layers[name] = torch.full((*size, 1), constant) if values is None else values[..., None]
     layers["strength"] = (layers["strength"] / alpha).clamp(max=1)
-    layers["reflectance"] = _reflectance(model, view.camera)
+    layers["reflectance"] = result.layers.get("reflectance", torch.zeros(*size, 3))
     index = result.layers.get("index", torch.full(size, model.shading.refractive_index))
     layers["index"] = index[..., None]
     layers["normal"] = result.normal
     return layers
 
 
-def _reflectance(model: GaussianModel, camera: Camera) -> Tensor:
-    """Reflectance [H, W, 3] of metals at normal incidence; 0 where there are none."""
-    gaussians = model.state.gaussians
-    if not any_nonzero(gaussians, "metalness"):
-        return torch.zeros(camera.height, camera.width, 3)
-    own = metal_channels(gaussians["metalness"], reflectance(gaussians["reflectance_logits"]))
-    picture = model.backend.rasterize(splats(gaussians, own), camera).features.cpu()
-    return picture[..., :3] / picture[..., 3:].clamp(min=1e-3)
-
-
 def _reliable_depth(result: RenderResult, view: View | None) -> Tensor:
-    """Depth [H, W] of the surface; 0 where a pixel is translucent, on the outline of something, or, of photographs,
-    invalid."""
+    """Return the depth [H, W] of the surface, 0 for unreliable pixels.
+
+    Unreliable pixels are translucent, on an outline, or invalid in the photograph of ``view``.
+    """
     depth = result.depth
     far = max_pool2d(depth[None, None], 3, 1, 1)[0, 0]
     near = -max_pool2d(-depth[None, None], 3, 1, 1)[0, 0]
-    # Further apart than the surface picture is thick, to both sides: a pixel between them mixes two surfaces.
+    # A pixel between depths that differ by more than the thickness of the surface picture mixes two surfaces.
     solid = (result.alpha > OPAQUE) & (far - near < 2 * WIDTH * depth)
     if view is not None:
         solid &= ~view.invalid.cpu()
@@ -184,7 +174,7 @@ def _reliable_depth(result: RenderResult, view: View | None) -> Tensor:
 def _visible(
     points: Tensor, normals: Tensor, camera: Camera, depth: Tensor, voxel: float
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Rows [K] of the points that a view shows, their weights [K], and where, [K, 2] in [-1, 1] as PyTorch counts."""
+    """Return the visible points: rows [K], weights [K], and pixel positions [K, 2] in [-1, 1] for ``grid_sample``."""
     offsets = points - camera.center.float()
     cosine = -dot(unit(offsets), normals)
     rows = (cosine > STEEPEST).nonzero()[:, 0]
@@ -200,7 +190,7 @@ def _visible(
     row = row[inside]
     surface = depth[row.long(), column.long()]
     cosine = cosine[rows]
-    # Half a pixel beside it, an inclined surface has another depth, too.
+    # The depth of an inclined surface changes within half a pixel.
     tolerance = (NEAR * voxel + 0.5 * z / camera.fx) / cosine.clamp(min=0.3)
     visible = (surface > 0) & ((surface - z).abs() < tolerance)
     places = torch.stack((2 * column / camera.width - 1, 2 * row / camera.height - 1), dim=-1)
@@ -208,7 +198,7 @@ def _visible(
 
 
 def _nearest_seen(places: NDArray[np.float32], visible: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """For each texel that no view shows the nearest that one does, about; itself where none is."""
+    """Return the approximately nearest visible texel of each other texel, or the texel itself if none is visible."""
     known = visible.nonzero()[0]
     unseen = (~visible).nonzero()[0]
     if not len(known) or not len(unseen):

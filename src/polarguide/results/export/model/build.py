@@ -1,4 +1,4 @@
-"""From a run to a textured mesh: surface, charts, baked textures, and base color without shading."""
+"""Conversion of a run to a textured mesh: surface, charts, baked textures, and base color without shading."""
 
 from __future__ import annotations
 
@@ -18,9 +18,8 @@ from polarguide.core.system import free_memory
 from polarguide.results.export.model.bake import Baked, ColorSource, bake
 from polarguide.results.export.model.gltf import Textured, color_pixels, linear_pixels
 from polarguide.results.export.model.irradiance import WHAT, Surroundings, arriving_light, delit, irradiance
-from polarguide.results.export.model.subject import SurfaceView, subject_surface
-from polarguide.results.export.model.texels import Texels, rasterized_texels
-from polarguide.results.export.model.unwrap import Unwrapped, unwrap
+from polarguide.results.export.model.topology import SurfaceView, subject_surface
+from polarguide.results.export.model.unwrap import Texels, Unwrapped, rasterized_texels, unwrap
 from polarguide.results.export.placement import Placement
 from polarguide.results.rendering.mesh import ColoredMesh, Surface, fused_surface, painted
 from polarguide.results.rendering.relight import mirrored_light, needs_radiance
@@ -36,26 +35,28 @@ SOURCES: dict[BaseColor, ColorSource] = {
     "picture": "final",
 }
 BASE_COLORS: dict[BaseColor, str] = {
-    "delit": "highlights taken off, shading divided out by the learned light, up to one brightness factor",
-    "diffuse": "highlights taken off, shading baked in",
+    "delit": "highlights removed, shading divided by the learned light, up to one brightness factor",
+    "diffuse": "highlights removed, shading baked in",
     "photographs": "mean of the photographs, highlights and shading baked in",
     "picture": "mean of the rendered pictures, highlights and shading baked in",
 }
-"""The words about base color in exported files."""
+"""Description of each kind of base color in exported files."""
 WHITEST = 0.9
-"""Reflectance of the whitest surfaces, such as white paint and porcelain, which hardly anything exceeds."""
+"""Reflectance of the whitest common surfaces, such as white paint and porcelain."""
 BRIGHT_SHARE = 0.01
-"""Of the surface may be brighter before all of it is darkened: highlights that are left, and noise."""
+"""Share of the surface, such as highlights and noise, that may exceed ``WHITEST`` before a global scale applies."""
 SURROUNDINGS_RESOLUTION = 128
-"""Voxels along the longest side of what lies outside the crop box: it only shades, and shadows are soft."""
-_TOGETHER = 1 << 18
-"""Texels whose irradiance is found together: about 100 MB."""
+"""Voxels along the longest side of the scene outside the crop box, which only casts soft shadows."""
+_BATCH = 1 << 18  # texels per batch of the irradiance, about 100 MB
 BYTES_PER_TEXEL = 190
-"""Most that a texel takes while textures are baked and filled: the sum of the arrays that are held together."""
+"""Peak memory per texel during baking and filling of textures."""
 
 
 def require_room(texture: int) -> None:
-    """Check that a texture of so many texels along its side fits into memory.
+    """Check that a square texture fits into memory.
+
+    Args:
+        texture: texels along its side.
 
     Raises:
         PolarguideError: the texture does not fit.
@@ -67,17 +68,18 @@ def require_room(texture: int) -> None:
             "--texture",
             expected=f"a texture that fits into {free / 1e9:.1f} GB of free memory",
             found=f"{texture} x {texture} texels, which take {needed / 1e9:.1f} GB",
-            remedy="Give a smaller one.",
+            remedy="Choose a smaller texture.",
         )
 
 
 @dataclass(frozen=True, eq=False)
 class Charted:
-    """The subject of a run as a mesh with texture coordinates.
+    """Subject of a run as a mesh with texture coordinates.
 
     Attributes:
-        mesh: with colors of the diffuse layer. inside: what belongs to it. voxel: side of those it was fused in.
-        unwrapped: the mesh, split along the borders of charts. texels: places of the texture's texels.
+        mesh: the mesh with colors of the diffuse layer. inside: region of the subject. voxel: side of a voxel
+            of the fusion.
+        unwrapped: the mesh, split along the borders of charts. texels: texels of the texture.
     """
 
     mesh: ColoredMesh
@@ -96,17 +98,17 @@ def charted_subject(
     folder: Path,
     reporter: Reporter,
 ) -> Charted:
-    """The surface of what is to be exported, with texture coordinates.
+    """Return the surface of the subject with texture coordinates.
 
     Args:
-        run: of Gaussians; its scene is read. surface_view: renders a view of the subject's Gaussians.
-        inside: what belongs to the subject; None: everything. options: options of the model.
-        resolution: voxels along its longest side.
-        folder: for temporary files. reporter: receives progress, counts and warnings.
+        run: the run; its scene is read. surface_view: renders a view of the subject's Gaussians.
+        inside: region of the subject; None for everything. options: options of the model.
+        resolution: number of voxels along its longest side.
+        folder: folder for temporary files. reporter: receives progress, counts and warnings.
 
     Raises:
-        PolarguideError: a package is missing, the texture does not fit into memory, there is no surface, or delighting
-            is asked of a recipe that learns no radiance.
+        PolarguideError: a package is missing, the texture does not fit into memory, there is no surface, or
+            delighting needs radiance that the recipe does not learn.
     """
     require_room(options.texture)
     if options.resolved_base_color == "delit":
@@ -127,10 +129,11 @@ def textured_model(
     options: ModelOptions,
     reporter: Reporter,
 ) -> Textured:
-    """The subject of a run as a textured mesh, upright (+y) as glTF has it.
+    """Return the subject of a run as a textured mesh, +y up.
 
     Args:
-        run: of Gaussians; its scene is read. subject: its surface. presentation, placement: how it is presented.
+        run: the run; its scene is read. subject: its surface. presentation, placement: color, and scale of
+            the file.
         options: options of the model. reporter: receives progress and counts.
     """
     mesh = subject.mesh
@@ -144,7 +147,7 @@ def textured_model(
     baked = bake(run, run.scene.train_views, places, facing, SOURCES[kind], subject.voxel, reporter)
     reporter.say(
         f"{unwrapped.charts:,} charts, {len(texels.index) / options.texture**2:.0%} of the texture used; "
-        f"{1 - baked.seen.mean():.1%} of the surface is in no view and has the nearest color"
+        f"{1 - baked.seen.mean():.1%} of the surface is not visible in any view and has the nearest color"
     )
     light = None
     if kind == "delit":
@@ -153,10 +156,10 @@ def textured_model(
     color, baked = _presented(baked, light, presentation.color, _index(run), reporter)
     axes = run.frame.panorama_axes().numpy()
     textures = _textures(run, baked, texels, options.albedo_scale * color, lit=not options.unlit)
-    added = []
-    for place, values in [] if options.unlit else baked.added:
-        rgb = np.broadcast_to(values, (len(values), 3))
-        added.append((place, linear_pixels(texels.texture(rgb))))
+    added = [
+        (place, linear_pixels(texels.texture(np.broadcast_to(values, (len(values), 3)))))
+        for place, values in baked.added
+    ]
     return Textured(
         placement.scale * vertices @ axes,
         _unit(normals @ axes),
@@ -164,15 +167,19 @@ def textured_model(
         _drawn(unwrapped),
         *textures,
         _index(run),
-        added,
+        [] if options.unlit else added,
     )
 
 
 def _presented(
     baked: Baked, light: NDArray[np.float32] | None, color: Tensor | None, index: float, reporter: Reporter
 ) -> tuple[NDArray[np.float32], Baked]:
-    """Base color [M, 3] of linear sRGB, divided by the irradiance ``light`` [M, 3] if there is one; and texels with the
-    reflectance of metals in it. Radiance and irradiance get the color of the presentation before they are divided.
+    """Apply the color of the presentation, and divide radiance by the irradiance ``light`` [M, 3] if given.
+
+    Radiance and irradiance get the color of the presentation before the division.
+
+    Returns:
+        Base color [M, 3] of linear sRGB, and the texels with the adapted reflectance of metals.
     """
     metal = colored_reflectance(torch.from_numpy(baked.reflectance), color).numpy()
     colors = colored(torch.from_numpy(baked.color), color).numpy()
@@ -183,27 +190,27 @@ def _presented(
 
 
 def _within_white(color: NDArray[np.float32], baked: Baked, reporter: Reporter) -> NDArray[np.float32]:
-    """Delit color [M, 3] that is nowhere whiter than surfaces can be: it is known up to one factor only, and what few
-    texels have beyond is light that the environment does not hold. Hues stay."""
+    """Scale delit colors [M, 3] to reflectances of at most ``WHITEST`` and clip the rest without a change of hue.
+
+    Delit color has an unknown common factor. Brighter texels contain light that the environment lacks.
+    """
     dielectric = color[baked.seen & (baked.metalness < 0.5)]
     brightest = float(np.quantile(dielectric.max(axis=1), 1 - BRIGHT_SHARE)) if len(dielectric) else 0.0
     if brightest > WHITEST:
         factor = WHITEST / brightest
-        reporter.say(f"base color times {factor:.2f}, so that surfaces reflect {WHITEST:.0%} at most")
+        reporter.say(f"base color times {factor:.2f}, so that surfaces reflect at most {WHITEST:.0%}")
         color = color * np.float32(factor)
-    return color * np.minimum(1, WHITEST / np.maximum(color.max(axis=1, keepdims=True), 1e-6)).astype(
-        np.float32
-    )
+    limit = np.minimum(1, WHITEST / np.maximum(color.max(axis=1, keepdims=True), 1e-6))
+    return color * limit.astype(np.float32)
 
 
 def _unit(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Unit vectors [V, 3] once they are rounded; up where there is no direction."""
+    """Normalize vectors [V, 3]; +y for a zero vector."""
     length = np.linalg.norm(vectors, axis=1, keepdims=True)
     return np.where(length > 1e-9, vectors / np.maximum(length, 1e-9), [[0.0, 1.0, 0.0]])
 
 
 def _drawn(mesh: Unwrapped) -> NDArray[np.int64]:
-    """Faces with three different vertices."""
     a, b, c = mesh.faces.T
     return mesh.faces[(a != b) & (b != c) & (c != a)]
 
@@ -213,7 +220,7 @@ def _index(run: OpenedRun) -> float:
 
 
 def _learned(normals: NDArray[np.float32], facing: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Unit normals [M, 3] as they were learned; that of the mesh where none was, or one that looks away."""
+    """Return unit normals [M, 3]: the learned ones, or those of the mesh for missing or inward ones."""
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     agrees = (length > 1e-3) & ((normals * facing).sum(axis=1, keepdims=True) > 0)
     return np.where(agrees, normals / np.maximum(length, np.float32(1e-3)), facing)
@@ -226,13 +233,15 @@ def _irradiance(
     normals: NDArray[np.float32],
     index: float,
 ) -> NDArray[np.float32]:
-    """Irradiance [M, 3] at the texels, of the light [V, K, 3] that arrives at the vertices."""
+    """Return the irradiance [M, 3] at the texels from light [V, K, 3] at the vertices."""
     count = arriving.shape[1]
     light = np.empty_like(normals)
-    for begin in range(0, len(normals), _TOGETHER):
-        part = slice(begin, begin + _TOGETHER)
-        some = replace(texels, index=texels.index[part], face=texels.face[part], weights=texels.weights[part])
-        between = some.interpolated(faces, arriving.reshape(len(arriving), -1)).reshape(-1, count, 3)
+    for begin in range(0, len(normals), _BATCH):
+        part = slice(begin, begin + _BATCH)
+        batch = replace(
+            texels, index=texels.index[part], face=texels.face[part], weights=texels.weights[part]
+        )
+        between = batch.interpolated(faces, arriving.reshape(len(arriving), -1)).reshape(-1, count, 3)
         light[part] = irradiance(between, normals[part], index)
     return light
 
@@ -240,9 +249,9 @@ def _irradiance(
 def _arriving(
     run: OpenedRun, mesh: ColoredMesh, inside: Inside | None, reporter: Reporter
 ) -> NDArray[np.float64]:
-    """Harmonics [V, K, 3] of the light that arrives at the vertices of the subject."""
+    """Return harmonics [V, K, 3] of the incident light at the vertices of the subject."""
     cubemap = needs_radiance(run.model.shading, what=WHAT)
-    with reporter.track("light that is mirrored", len(run.scene.train_views)) as progress:
+    with reporter.track("reflected light", len(run.scene.train_views)) as progress:
         texels = mirrored_light(run, cubemap, progress)
 
     def radiance(directions: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -256,7 +265,7 @@ def _arriving(
 
 
 def _outside(run: OpenedRun, inside: Inside) -> ColoredMesh:
-    """What the scene has beside the subject: it shades the subject and gives light back."""
+    """Return the mesh of the scene outside the subject, which shades the subject and reflects light."""
     surface, views, box = fused_surface(run.cameras, run.result, resolution=SURROUNDINGS_RESOLUTION)
     mesh = painted(surface, views, box)
     faces = surface.faces[~inside(surface.vertices)[surface.faces].any(axis=1)]
@@ -278,7 +287,7 @@ def _joined(first: ColoredMesh, second: ColoredMesh) -> ColoredMesh:
 def _textures(
     run: OpenedRun, baked: Baked, texels: Texels, color: NDArray[np.float32], *, lit: bool
 ) -> tuple[NDArray[np.uint8], NDArray[np.uint8] | None, NDArray[np.uint8] | None]:
-    """Base color, surface and specular factor, as ``Textured`` has them."""
+    """Return the base color, surface and specular textures of ``Textured``."""
     if not lit:
         return color_pixels(texels.texture(color)), None, None
     metal = baked.metalness[:, None]
@@ -287,7 +296,7 @@ def _textures(
     shading = run.model.shading
     specular = None
     if isinstance(shading, DeferredShading) and shading.blend == "fresnel":
-        # The file has one index: others reflect as much at normal incidence by a factor, as far as it reaches.
+        # The file has one index. A factor gives other indices their reflectance at normal incidence.
         ratio = _normal_reflectance(baked.index) / _normal_reflectance(np.float32(_index(run)))
         specular = linear_pixels(texels.texture((baked.strength * ratio)[:, None]))[..., 0]
     return color_pixels(texels.texture(mixed)), linear_pixels(texels.texture(surface)), specular

@@ -1,36 +1,40 @@
-"""A textured mesh as one binary glTF 2.0 file."""
+"""Export of a textured mesh as a binary glTF 2.0 file, or as Wavefront OBJ with material and textures.
+
+Roughness and metalness of OBJ are in the fields ``map_Pr`` and ``map_Pm`` of Clara.io's extension, which Blender reads.
+"""
 
 from __future__ import annotations
 
+import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
+from polarguide.core.files import atomic_folder
 from polarguide.optics.color import srgb_encode_array
 from polarguide.results.export.glb import ELEMENTS, Binary
 from polarguide.shading.surface import GltfTexture
 
 QUALITY = 92
-"""Of JPEG textures."""
 _SAMPLER = {"magFilter": 9729, "minFilter": 9987, "wrapS": 33071, "wrapT": 33071}
-"""Linear with mip maps; clamped to the edge."""
+"""Sampler with mip maps, clamped to the edge."""
 Pixels = NDArray[np.uint8]
 
 
 @dataclass(frozen=True, eq=False)
 class Textured:
-    """A mesh with its textures, in the axes and units of the file.
+    """Mesh with textures, in the axes and units of the file.
 
     Attributes:
-        vertices, normals: [V, 3]. uv: [V, 2], v down from the first row. faces: [F, 3].
-        base_color: [T, T, 3] sRGB. surface: [T, T, 3] roughness in green, metalness in blue; None: unlit.
-        specular: [T, T] factor on a dielectric's reflection; None: 1. index: refractive index.
-        added: [T, T, 3] textures of added surface properties, which GLB files alone have.
+        vertices, normals: [V, 3]. uv: [V, 2], with v down from the first row. faces: [F, 3].
+        base_color: [T, T, 3] sRGB. surface: [T, T, 3] roughness in green, metalness in blue; None for unlit.
+        specular: [T, T] factor on a dielectric's reflection; None for 1. index: refractive index.
+        added: [T, T, 3] textures of added surface properties, only for GLB files.
     """
 
     vertices: NDArray[np.float64]
@@ -45,30 +49,29 @@ class Textured:
 
 
 def color_pixels(linear: NDArray[np.float32]) -> Pixels:
-    """Linear colors as sRGB bytes: how glTF has base color."""
+    """Encode linear colors as sRGB bytes, the encoding of base color in glTF."""
     return np.asarray(np.rint(255 * srgb_encode_array(np.clip(linear, 0, 1))), np.uint8)
 
 
 def linear_pixels(values: NDArray[np.float32]) -> Pixels:
-    """Values in [0, 1] as bytes: how glTF has roughness, metalness and factors."""
+    """Encode values in [0, 1] as bytes, the encoding of roughness, metalness and factors in glTF."""
     return np.asarray(np.rint(255 * np.clip(values, 0, 1)), np.uint8)
 
 
 def encoded(pixels: Pixels, *, jpeg: bool) -> tuple[str, bytes]:
-    """The media type and the file of a picture [H, W, 3 or 4]; transparency only as PNG."""
-    order = [2, 1, 0, 3][: pixels.shape[2]]
-    flags = [cv2.IMWRITE_JPEG_QUALITY, QUALITY] if jpeg else []
-    done, data = cv2.imencode(".jpg" if jpeg else ".png", np.ascontiguousarray(pixels[..., order]), flags)
-    assert done
-    return ("image/jpeg" if jpeg else "image/png"), data.tobytes()
+    """Encode a picture [H, W, 3 or 4] and return its media type and file; transparency requires PNG."""
+    kind = "jpeg" if jpeg else "png"
+    file = io.BytesIO()
+    Image.fromarray(pixels).save(file, kind, quality=QUALITY)
+    return f"image/{kind}", file.getvalue()
 
 
 def write_glb(path: Path, model: Textured, asset: dict[str, Any], *, jpeg: bool) -> None:
-    """Write the file.
+    """Write a textured mesh.
 
     Args:
-        path: the file. model: the mesh. asset: glTF's record of whom and what made it, without the version.
-        jpeg: whether base color, roughness and metalness are JPEG; else PNG.
+        path: the file. model: the mesh. asset: glTF asset record without the version.
+        jpeg: encode base color, roughness and metalness as JPEG instead of PNG.
 
     Raises:
         PolarguideError: the file cannot be written.
@@ -92,13 +95,13 @@ def write_glb(path: Path, model: Textured, asset: dict[str, Any], *, jpeg: bool)
 
 
 def _material(model: Textured, *, jpeg: bool) -> tuple[list[tuple[str, bytes]], dict[str, Any], list[str]]:
-    """The images, the material that names them by number, and the extensions that it uses."""
+    """Return the images, the material that references them by index, and its extensions."""
     images = [encoded(model.base_color, jpeg=jpeg)]
     shading: dict[str, Any] = {"baseColorTexture": {"index": 0}}
     material: dict[str, Any] = {"name": "surface", "pbrMetallicRoughness": shading}
     extensions: dict[str, Any] = {}
     if model.surface is None:
-        # What readers without the extension draw instead: no highlight.
+        # Readers without the extension draw no highlight.
         shading |= {"metallicFactor": 0.0, "roughnessFactor": 1.0}
         extensions["KHR_materials_unlit"] = {}
     else:
@@ -114,3 +117,49 @@ def _material(model: Textured, *, jpeg: bool) -> tuple[list[tuple[str, bytes]], 
         extension |= {**place.constants, place.texture: {"index": len(images)}}
         images.append(encoded(pixels, jpeg=False))
     return images, {**material, "extensions": extensions}, [*extensions]
+
+
+NAME = "model"
+_GRAY = 3
+
+
+def write_obj(folder: Path, model: Textured, lines: Sequence[str], *, jpeg: bool) -> list[Path]:
+    """Write ``model.obj``, ``model.mtl`` and the textures ``model-color``, ``model-roughness`` and ``model-metalness``.
+
+    Args:
+        folder: folder to write. model: the mesh. lines: comments. jpeg: encode the color as JPEG instead of
+            PNG.
+
+    Raises:
+        PolarguideError: a file cannot be written.
+    """
+    pictures: dict[str, Pixels] = {"color": model.base_color}
+    if model.surface is not None:
+        for channel, name in ((1, "roughness"), (2, "metalness")):
+            pictures[name] = np.repeat(model.surface[..., channel, None], _GRAY, axis=2)
+    names = {name: f"{NAME}-{name}.{'jpg' if jpeg and name == 'color' else 'png'}" for name in pictures}
+    head = "".join(f"# {line}\n" for line in lines)
+    with atomic_folder(folder) as temporary:
+        for name, pixels in pictures.items():
+            (temporary / names[name]).write_bytes(encoded(pixels, jpeg=jpeg and name == "color")[1])
+        (temporary / f"{NAME}.mtl").write_text(head + _obj_material(names, model), encoding="ascii")
+        (temporary / f"{NAME}.obj").write_text(head + _geometry(model), encoding="ascii")
+    return [folder / f"{NAME}.obj", folder / f"{NAME}.mtl", *(folder / name for name in names.values())]
+
+
+def _obj_material(names: dict[str, str], model: Textured) -> str:
+    lit = "roughness" in names
+    lines = ["newmtl surface", "Kd 1 1 1", f"map_Kd {names['color']}"]
+    if lit:
+        lines += [f"Ni {model.index:g}", f"map_Pr {names['roughness']}", f"map_Pm {names['metalness']}"]
+    return "\n".join([*lines, f"illum {2 if lit else 0}"]) + "\n"  # 0 means constant color.
+
+
+def _geometry(model: Textured) -> str:
+    uv = np.stack([model.uv[:, 0], 1 - model.uv[:, 1]], axis=1)  # In OBJ v starts at the last row.
+    numbers = model.faces + 1
+    lines = [f"mtllib {NAME}.mtl", "usemtl surface"]
+    for word, values in (("v", model.vertices), ("vt", uv), ("vn", model.normals)):
+        lines += [f"{word} {' '.join(f'{number:.7g}' for number in row)}" for row in values.tolist()]
+    lines += [f"f {a}/{a}/{a} {b}/{b}/{b} {c}/{c}/{c}" for a, b, c in numbers.tolist()]
+    return "\n".join(lines) + "\n"

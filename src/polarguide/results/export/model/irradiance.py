@@ -1,12 +1,12 @@
-"""Irradiance of a mesh under the learned light: what base color is divided by, so that no shading is left in it.
+"""Irradiance of a mesh under the learned light. Division of the diffuse layer by it removes shading.
 
-A smooth dielectric with a diffuse base of albedo a has, seen at normal incidence, the diffuse radiance
+A smooth dielectric with a diffuse base of albedo a has, at normal incidence, the diffuse radiance
 
     D = a T(0) E,   E = (1 / pi) integral of T(i) L(w) cos(i) dw
 
-with T the share of light that passes its surface. L is the environment's radiance where nothing is in the way, else the
-diffuse layer of what is hit: one bounce, of light that the run has measured with all bounces before it. Rays begin at
-the vertices, where light is kept as spherical harmonics; normals are those of the texels, so that edges are sharp.
+with the share T of light that passes its surface. L is the radiance of the environment, or the diffuse layer
+of an occluder. The diffuse layer already contains all further bounces. Rays start at the vertices and are
+stored as spherical harmonics. The normals are those of the texels, so that edges stay sharp.
 """
 
 from __future__ import annotations
@@ -30,18 +30,14 @@ from polarguide.results.export.model.topology import Places
 from polarguide.results.rendering.mesh import ColoredMesh
 
 RAYS = 384
-"""Rays from each vertex to all sides: the noise of their mean is a few percent, and textures smooth it between
-vertices."""
+"""Number of rays per vertex. The noise of their mean is a few percent, and interpolation smooths it."""
 DEGREE = 2
-"""Of the harmonics that light is kept in: a cosine lobe passes hardly any of the others.
-
-Ramamoorthi and Hanrahan 2001 have shown it."""
-_TOGETHER = 1 << 19
-"""Rays traced together: about 100 MB."""
+"""Degree of the harmonics of incident light. A cosine lobe removes higher ones (Ramamoorthi and Hanrahan 2001)."""
+_BATCH = 1 << 19  # rays, about 100 MB
 OFFSET = 2.5e-3
-"""How far from the surface rays begin, as a share of the diagonal of all that can be hit."""
+"""Offset of the rays from the surface, relative to the diagonal of the occluders."""
 FLOOR = 0.05
-"""Irradiance counts at least as this share of its mean over the mesh: division by less would only enlarge noise."""
+"""Lower bound of irradiance relative to its mean over the mesh. Division by less would amplify noise."""
 
 WHAT = "--base-color delit"
 Radiance = Callable[[NDArray[np.float64]], NDArray[np.float64]]
@@ -49,11 +45,11 @@ Radiance = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
 @dataclass(frozen=True, eq=False)
 class Surroundings:
-    """What lights a mesh.
+    """Light sources of a mesh.
 
     Attributes:
-        radiance: from afar, [N, 3] of unit directions [N, 3]. occluder: what stands in its way, with linear diffuse
-            radiance at its vertices.
+        radiance: radiance of the environment.
+        occluder: mesh in front of the environment, with linear diffuse radiance at its vertices.
     """
 
     radiance: Radiance
@@ -61,7 +57,7 @@ class Surroundings:
 
 
 def arriving_light(points: Places, normals: Places, around: Surroundings, advance: Advance) -> Places:
-    """Harmonics [V, K, 3] of the light that arrives at points [V, 3] of a surface with unit normals [V, 3].
+    """Return harmonics [V, K, 3] of the incident light at points [V, 3] of a surface with unit normals [V, 3].
 
     Raises:
         PolarguideError: embreex is not installed.
@@ -71,12 +67,11 @@ def arriving_light(points: Places, normals: Places, around: Surroundings, advanc
     random = np.random.default_rng(0)
     spread = spread_directions(RAYS).numpy()
     total = np.zeros((len(points), (DEGREE + 1) ** 2, 3))
-    step = max(1, _TOGETHER // RAYS)
+    step = max(1, _BATCH // RAYS)
     for begin in range(0, len(points), step):
         part = slice(begin, begin + step)
-        # Each turned at random: else all would share a pattern.
-        turns = Rotation.random(len(points[part]), random).as_matrix()
-        directions = spread @ turns
+        # Random rotations avoid a common pattern.
+        directions = spread @ Rotation.random(len(points[part]), random).as_matrix()
         origins = np.repeat(points[part] + offset * normals[part], RAYS, axis=0)
         light = rays.arriving(origins, directions.reshape(-1, 3), around.radiance).reshape(-1, RAYS, 3)
         total[part] = 4 * math.pi / RAYS * _basis(directions).swapaxes(1, 2) @ light
@@ -85,7 +80,7 @@ def arriving_light(points: Places, normals: Places, around: Surroundings, advanc
 
 
 def irradiance(light: NDArray[Any], normals: NDArray[Any], index: float) -> NDArray[np.float32]:
-    """E [M, 3] on surfaces of a refractive index with unit normals [M, 3], of light in harmonics [M, K, 3]."""
+    """Return the irradiance [M, 3] of a dielectric with unit normals [M, 3] from harmonics of light [M, K, 3]."""
     cosines, weights = np.polynomial.legendre.leggauss(64)
     cosines = (cosines + 1) / 2
     weights = weights / 2
@@ -94,8 +89,8 @@ def irradiance(light: NDArray[Any], normals: NDArray[Any], index: float) -> NDAr
         (passed * legendre(cosines)).sum()
         for legendre in map(np.polynomial.Legendre.basis, range(DEGREE + 1))
     ]
-    each = np.repeat(lobe, 2 * np.arange(DEGREE + 1) + 1)  # a harmonic of degree l has 2 l + 1 orders
-    return np.asarray(np.einsum("mk,mkc->mc", each * _basis(normals), light), np.float32)
+    factors = np.repeat(lobe, 2 * np.arange(DEGREE + 1) + 1)  # Degree l has 2 l + 1 harmonics.
+    return np.asarray(np.einsum("mk,mkc->mc", factors * _basis(normals), light), np.float32)
 
 
 def _basis(directions: NDArray[Any]) -> Places:
@@ -103,7 +98,7 @@ def _basis(directions: NDArray[Any]) -> Places:
 
 
 def delit(diffuse: NDArray[np.float32], light: NDArray[np.float32], index: float) -> NDArray[np.float32]:
-    """Base color [..., 3] of the diffuse layer and irradiance; see the module's text."""
+    """Return the base color [..., 3] of a diffuse layer and its irradiance; see the module's formula."""
     floored = np.maximum(light, np.float32(FLOOR * light.mean()))
     passed = np.float32(1 - _reflectance(np.ones(1), index)[0])
     return np.asarray(diffuse / (floored * passed), np.float32)
@@ -115,7 +110,7 @@ def _reflectance(cosine: NDArray[np.float64], index: float) -> NDArray[np.float6
 
 
 class _Rays:
-    """Rays against a mesh, by Embree.
+    """Embree scene of a mesh.
 
     Raises:
         PolarguideError: embreex is not installed.
@@ -128,10 +123,10 @@ class _Rays:
         self._colors = mesh.colors
         corners = np.ascontiguousarray(mesh.surface.vertices[self._faces], np.float32)
         self._scene = scenes.EmbreeScene()
-        self._geometry = meshes.TriangleMesh(self._scene, corners)  # the scene keeps no reference to it
+        self._geometry = meshes.TriangleMesh(self._scene, corners)  # The scene holds no reference.
 
     def arriving(self, origins: Places, directions: Places, radiance: Radiance) -> Places:
-        """Radiance [N, 3] at origins from unit directions [N, 3]: the mesh's colors, or from afar past it."""
+        """Return the radiance [N, 3] at origins from unit directions [N, 3], of the mesh or the environment."""
         starts, rays = (np.ascontiguousarray(values, np.float32) for values in (origins, directions))
         hits = self._scene.run(starts, rays, output=True)
         light = radiance(directions)

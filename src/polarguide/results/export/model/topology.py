@@ -1,26 +1,44 @@
-"""Clean and simplify a triangle mesh so that every edge has one face on each side, or is counted as a boundary."""
+"""Clean mesh of a run's subject: a simplified manifold with counted boundary edges."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
 from polarguide.core.errors import optional_import
-from polarguide.results.rendering.mesh import NoSurfaceError, Surface, largest_pieces
+from polarguide.core.files import write_whole
+from polarguide.core.options import ModelOptions
+from polarguide.core.progress import Reporter
+from polarguide.geometry.camera import Camera
+from polarguide.results.rendering.mesh import (
+    Box,
+    ColoredMesh,
+    DepthSamples,
+    NoSurfaceError,
+    Surface,
+    face_pieces,
+    fused_surface,
+    largest_pieces,
+)
+from polarguide.results.rendering.subject import Inside
+from polarguide.runs.opened import OpenedRun
+from polarguide.shading.result import RenderResult
 
 ISLAND = 0.01
-"""Pieces with fewer faces than this share of the largest one's are dropped."""
+"""Share of the largest piece's faces below which a piece is removed."""
 WELD = 1e-6
-"""Vertices nearer than about this share of the longest side are one."""
+"""Distance, relative to the longest side, below which vertices are merged."""
 SMALL_HOLE = 0.1
-"""A hole is closed up to this perimeter, as a share of the diagonal of the mesh: about a thirtieth of it across. Larger
-ones are where no camera looked."""
+"""Perimeter, relative to the diagonal of the mesh, up to which a hole is closed.
+
+Larger holes are regions that no camera saw.
+"""
 
 Faces = NDArray[np.int64]
 Places = NDArray[np.float64]
@@ -28,8 +46,13 @@ Places = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Topology:
-    """Counts of a mesh: edges with a face on one side alone, edges with more than two faces or with faces of opposite
-    orientation, and connected pieces."""
+    """Counts of a mesh.
+
+    Attributes:
+        boundary_edges: edges with one face.
+        non_manifold_edges: edges with more than two faces or with inconsistent orientation.
+        pieces: connected pieces.
+    """
 
     boundary_edges: int
     non_manifold_edges: int
@@ -37,30 +60,26 @@ class Topology:
 
 
 def topology(faces: Faces) -> Topology:
-    """The counts of faces [F, 3]."""
+    """Count the edges and pieces of faces [F, 3]."""
     directed = _directed(faces)
     _, edge, count = np.unique(_keys(np.sort(directed, axis=1)), return_inverse=True, return_counts=True)
     forward = np.bincount(edge, weights=directed[:, 0] < directed[:, 1])
     wrong = (count > 2) | ((count == 2) & (forward != 1))
-    used, numbers = np.unique(faces, return_inverse=True)
-    ends = numbers.reshape(-1, 3)[:, [0, 1, 1, 2]].reshape(-1, 2)
-    graph = coo_matrix((np.ones(len(ends), np.int8), (ends[:, 0], ends[:, 1])), shape=(len(used),) * 2)
-    pieces = connected_components(graph, directed=False, return_labels=False)
-    return Topology(int((count == 1).sum()), int(wrong.sum()), int(pieces))
+    return Topology(int((count == 1).sum()), int(wrong.sum()), len(np.unique(face_pieces(faces))))
 
 
 def _directed(faces: Faces) -> NDArray[np.int64]:
-    """The three edges of each face in its sense of rotation, [3 F, 2]; those of face f are 3 f to 3 f + 2."""
+    """Return the edges of each face in its orientation, [3 F, 2]. Face f has the edges 3 f to 3 f + 2."""
     return faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
 
 
 def _keys(edges: NDArray[np.int64]) -> NDArray[np.int64]:
-    """One number for each pair of vertices [N, 2]."""
+    """Return one number for each pair of vertices [N, 2]."""
     return edges[:, 0] << 32 | edges[:, 1]
 
 
 def simplified(surface: Surface, triangles: int, *, closed: bool = False) -> Surface:
-    """At most about so many triangles (quadric error, Garland and Heckbert 1997), cleaned; see ``cleaned``.
+    """Simplify a surface to about the given number of triangles (Garland and Heckbert 1997) and clean it.
 
     Raises:
         PolarguideError: fast-simplification is not installed, or no face is left.
@@ -68,7 +87,7 @@ def simplified(surface: Surface, triangles: int, *, closed: bool = False) -> Sur
     if len(surface.faces) <= triangles:
         return cleaned(surface.vertices, surface.faces, closed=closed)
     simplify: Any = optional_import("fast_simplification", "a textured model").simplify
-    middle = surface.vertices.mean(axis=0)  # it computes in single precision
+    middle = surface.vertices.mean(axis=0)  # The library uses single precision.
     vertices, faces = simplify(
         np.ascontiguousarray(surface.vertices - middle, np.float32),
         np.ascontiguousarray(surface.faces, np.int32),
@@ -78,9 +97,10 @@ def simplified(surface: Surface, triangles: int, *, closed: bool = False) -> Sur
 
 
 def cleaned(vertices: Places, faces: Faces, *, closed: bool = False) -> Surface:
-    """The surface of faces whose edges each occur once in each direction at most, without islands and small holes.
+    """Return a surface whose edges occur at most once in each direction, without islands and small holes.
 
-    Where it is to be ``closed`` it has no hole at all: each is closed flat, as the bottom of what stood on a table.
+    Args:
+        closed: close every hole with a flat fan, such as the bottom of an object on a table.
 
     Raises:
         NoSurfaceError: no face is left.
@@ -100,7 +120,7 @@ def cleaned(vertices: Places, faces: Faces, *, closed: bool = False) -> Surface:
 
 
 def _welded(vertices: Places, faces: Faces) -> tuple[Places, Faces]:
-    """With one vertex for all that single precision, as files have it, hardly tells apart."""
+    """Merge vertices that single precision hardly distinguishes."""
     size = np.ptp(vertices, axis=0).max()
     cells = np.rint((vertices - vertices.min(axis=0)) / max(WELD * float(size), 1e-30)).astype(np.int64)
     _, first, number = np.unique(cells, axis=0, return_index=True, return_inverse=True)
@@ -108,10 +128,10 @@ def _welded(vertices: Places, faces: Faces) -> tuple[Places, Faces]:
 
 
 def consistent(vertices: Places, faces: Faces) -> Faces:
-    """Without degenerate faces, and of faces with the same edge in the same direction with one alone.
+    """Remove degenerate faces, and all but one of the faces with the same edge in the same direction.
 
-    Then no edge has more than two faces, and those agree in their orientation. The face stays that fits best around it,
-    of equals the largest.
+    Then no edge has more than two faces, and these have a consistent orientation. The face with the best fit
+    to its neighbors stays, or the largest of equally good ones.
     """
     corners = np.sort(faces, axis=1)
     faces = faces[(corners[:, 0] < corners[:, 1]) & (corners[:, 1] < corners[:, 2])]
@@ -120,7 +140,7 @@ def consistent(vertices: Places, faces: Faces) -> Faces:
     directed = _directed(faces)
     _, edge, count = np.unique(_keys(directed), return_inverse=True, return_counts=True)
     _, either, both = np.unique(_keys(np.sort(directed, axis=1)), return_inverse=True, return_counts=True)
-    # An edge fits where it has one face on each side.
+    # An edge of a manifold has one face on each side.
     misfits = ((count[edge] != 1) | (both[either] != 2)).reshape(-1, 3).sum(axis=1)
     rival = (count[edge] > 1).reshape(-1, 3).any(axis=1)
     oriented = [faces[~rival]]
@@ -134,7 +154,7 @@ def consistent(vertices: Places, faces: Faces) -> Faces:
 
 
 def _closed(vertices: Places, faces: Faces, largest: float) -> tuple[Places, Faces]:
-    """Close holes up to a perimeter, in shares of the diagonal, each with a fan of triangles about its middle."""
+    """Close holes up to a perimeter, relative to the diagonal, with a fan of triangles around their center."""
     directed = _directed(faces)
     edges = directed[~np.isin(_keys(directed), _keys(directed[:, ::-1]))]
     limit = largest * float(np.linalg.norm(np.ptp(vertices, axis=0)))
@@ -153,9 +173,9 @@ def _closed(vertices: Places, faces: Faces, largest: float) -> tuple[Places, Fac
 
 
 def _loops(edges: list[list[int]]) -> list[list[int]]:
-    """The simple cycles that boundary edges consist of: as many of them end at a vertex as begin there.
+    """Decompose boundary edges into simple cycles. Each vertex must have as many incoming as outgoing edges.
 
-    Where holes touch in a vertex, each gets a cycle of its own, so that no edge of a fan has a third face.
+    Holes that touch in a vertex have separate cycles, so that no edge of a fan has a third face.
     """
     following: dict[int, list[int]] = {}
     for begin, end in edges:
@@ -178,7 +198,7 @@ def _loops(edges: list[list[int]]) -> list[list[int]]:
 
 
 def vertex_normals(vertices: Places, faces: Faces) -> Places:
-    """Unit normals [V, 3], of the faces around each vertex, weighted by their areas; +z where these cancel."""
+    """Return unit normals [V, 3], the area-weighted mean of the adjacent faces; +z if they cancel."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     across = np.cross(b - a, c - a)
     total = np.stack(
@@ -186,3 +206,50 @@ def vertex_normals(vertices: Places, faces: Faces) -> Places:
     )
     length = np.linalg.norm(total, axis=1, keepdims=True)
     return np.where(length > 0, total / np.maximum(length, 1e-300), [[0.0, 0.0, 1.0]])
+
+
+SurfaceView = Callable[[Camera], RenderResult]
+"""Function that renders the surface of a view."""
+
+
+def subject_surface(
+    run: OpenedRun,
+    surface_view: SurfaceView,
+    inside: Inside | None,
+    options: ModelOptions,
+    resolution: int,
+    reporter: Reporter,
+) -> tuple[Surface, list[tuple[Camera, DepthSamples]], Box]:
+    """Return the simplified surface of the subject, the depth samples of each camera, and the grid of the fusion.
+
+    The reporter receives the counts of the surface.
+
+    Raises:
+        PolarguideError: there is no surface.
+    """
+    surface, views, box = fused_surface(run.cameras, surface_view, resolution=resolution)
+    if inside is not None:
+        surface = ColoredMesh(surface, surface.vertices).within(inside(surface.vertices)).surface
+    surface = simplified(surface, options.triangles, closed=options.close_bottom)
+    counts = topology(surface.faces)
+    reporter.say(
+        f"{len(surface.vertices):,} vertices, {len(surface.faces):,} triangles, {counts.pieces} pieces; "
+        f"{counts.boundary_edges:,} boundary edges, {counts.non_manifold_edges} non-manifold edges"
+    )
+    return surface, views, box
+
+
+def write_stl(path: Path, vertices: Places, faces: NDArray[np.int64], comment: str) -> None:
+    """Write a binary STL file.
+
+    Args:
+        path: the file. vertices: [V, 3] in the axes of the file. faces: [F, 3].
+        comment: text for the header, of which 80 characters are kept. It must not begin with "solid".
+
+    Raises:
+        PolarguideError: the file cannot be written.
+    """
+    trimesh = optional_import("trimesh", "--format stl")
+    mesh = trimesh.Trimesh(vertices, faces, process=False, validate=False)
+    header = comment.encode("ascii", "replace")[:80].ljust(80)
+    write_whole(path, header + mesh.export(file_type="stl")[80:])

@@ -1,1 +1,0 @@
-"""Verbs of comparisons and collections."""
