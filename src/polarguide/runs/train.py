@@ -33,12 +33,11 @@ from polarguide.runs.folder import (
     save_checkpoint,
     writing_to,
 )
-from polarguide.runs.health import HealthCheck, RecordedWarnings
+from polarguide.runs.health import HealthCheck, MetalReport, PlyFile, PolarizerReport, RecordedWarnings
 from polarguide.runs.memory_plan import MemoryPlan, pixels_of, plan_memory
 from polarguide.runs.model import GaussianModel
 from polarguide.runs.opened import OpenedRun, read_scene, trained_scene
 from polarguide.runs.painted import FOLDER, read_painted
-from polarguide.runs.reports import MetalReport, PlyFile, PolarizerReport
 from polarguide.training.angles.fits import gaussian_training
 from polarguide.training.callback import AnyCallback
 from polarguide.training.context import TrainingContext

@@ -235,11 +235,6 @@ class Weights:
         """True if a term needs the priors of a view."""
         return any(use.metadata["priors"] and not use.metadata["optional"] for use in self._used())
 
-    @property
-    def normals(self) -> bool:
-        """True if a term reads the rendered normals."""
-        return self._read("normal")
-
     def own_terms(self) -> Sequence[Callable[[Step, Any], Tensor | None]]:
         """Return the terms of the weights that a subclass of another package adds.
 
@@ -248,14 +243,9 @@ class Weights:
         return ()
 
     @property
-    def depth(self) -> bool:
-        """True if a term reads the rendered depth."""
-        return self._read("depth")
-
-    @property
-    def layers(self) -> bool:
-        """True if a term reads single rendered layers."""
-        return self._read("layers")
+    def rendered(self) -> frozenset[str]:
+        """Layers that the terms read: "normal", "depth" or "layers"."""
+        return frozenset().union(*(use.metadata["rendered"] for use in self._used()))
 
     @property
     def fields_read(self) -> frozenset[str]:
@@ -269,9 +259,6 @@ class Weights:
 
     def _used(self) -> list[Field[Any]]:
         return [weight for weight in fields(self) if getattr(self, weight.name)]
-
-    def _read(self, rendered: str) -> bool:
-        return any(rendered in use.metadata["rendered"] for use in self._used())
 
 
 def depth_normals(depth: Tensor, camera: Camera) -> Tensor:
