@@ -211,13 +211,13 @@ def _recipes_of(entry: EntryPoint) -> tuple[Recipe, ...]:
         loaded = loaded() if callable(loaded) else loaded
         recipes = (loaded,) if isinstance(loaded, Recipe) else tuple(loaded)
     except (Exception, SystemExit) as error:  # another package may raise any error
-        found = f"{type(error).__name__}: {error}"
-        raise PolarguideError(where, expected="recipes", found=found, remedy=remedy) from error
+        actual = f"{type(error).__name__}: {error}"
+        raise PolarguideError(where, expected="recipes", found=actual, remedy=remedy) from error
     for recipe in recipes:
         if not isinstance(recipe, Recipe):
             raise PolarguideError(where, expected="recipes", found=repr(recipe), remedy=remedy)
         check_recipe(recipe, where)
         if recipe.name in _BUILT_IN:
-            found = f"{recipe.name}, which is built in"
-            raise PolarguideError(where, expected="a unique name", found=found, remedy=remedy)
+            actual = f"{recipe.name}, which is built in"
+            raise PolarguideError(where, expected="a unique name", found=actual, remedy=remedy)
     return recipes

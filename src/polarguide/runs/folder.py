@@ -199,12 +199,12 @@ def checkpoint_tensors(run: Path) -> Iterator[dict[str, Tensor]]:
     path = run / CHECKPOINT
     if not path.exists():
         link = path.is_symlink()
-        again = "Restore the target of the link, or remove the link to begin at step 0."
+        restore = "Restore the target of the link, or remove the link to begin at step 0."
         raise PolarguideError(
             run,
             expected=f"a checkpoint ({CHECKPOINT})",
             found="a link to nowhere" if link else "none",
-            remedy=again if link else "Train first, or without --resume.",
+            remedy=restore if link else "Train first, or without --resume.",
         )
     require_file(path, expected="a checkpoint of this program", remedy="Train again into a new folder.")
     try:
@@ -239,10 +239,10 @@ def writing_to(run: Path) -> Iterator[None]:
             remedy="Wait until it has ended, or choose another folder.",
         ) from None
     except OSError as error:
-        found = error.strerror or str(error)
+        reason = error.strerror or str(error)
         remedy = "Free space on the disk, or change the rights."
         raise PolarguideError(
-            run / LOCK, expected="a file that can be locked", found=found, remedy=remedy
+            run / LOCK, expected="a file that can be locked", found=reason, remedy=remedy
         ) from None
     try:
         yield

@@ -383,8 +383,8 @@ def _neighbor_psnr(views: Sequence[View], psnr: Mapping[str, float | None]) -> d
     if len(scored) <= NEIGHBORS:
         return {}
     centers = torch.stack([view.camera.center for view in scored])
-    away = (centers - centers.mean(dim=0)).norm(dim=1).mean().clamp(min=1e-12)
-    places = torch.cat((centers / away, torch.stack([view.camera.rotation[2] for view in scored])), dim=1)
+    distance = (centers - centers.mean(dim=0)).norm(dim=1).mean().clamp(min=1e-12)
+    places = torch.cat((centers / distance, torch.stack([view.camera.rotation[2] for view in scored])), dim=1)
     distances = torch.cdist(places, places).fill_diagonal_(torch.inf)
     nearest = distances.topk(NEIGHBORS, largest=False).indices.tolist()
     values = [float(psnr[view.name] or 0.0) for view in scored]
@@ -416,16 +416,16 @@ def warnings_of(views: Mapping[str, ViewHealth], unseen: float | None, limits: L
         )
     exposed = {name: off for name, off in _exposed(views, limits).items() if name not in burned | bare}
     explained = burned | bare | exposed
-    far = [name for name in _far_under(views, limits) if name not in explained]
-    if far:
+    poor = [name for name in _far_under(views, limits) if name not in explained]
+    if poor:
         worst = ", ".join(
-            f"{name} ({views[name].psnr:.1f} dB, neighbors {views[name].beside:.1f} dB)" for name in far[:4]
+            f"{name} ({views[name].psnr:.1f} dB, neighbors {views[name].beside:.1f} dB)" for name in poor[:4]
         )
-        more = f" and {len(far) - 4} more" if len(far) > 4 else ""
+        rest = f" and {len(poor) - 4} more" if len(poor) > 4 else ""
         warnings.append(
-            f"training views with a far lower PSNR than their neighbors: {worst}{more}. Pose, polarizer angle, "
+            f"training views with a far lower PSNR than their neighbors: {worst}{rest}. Pose, polarizer angle, "
             "exposure or focus of these photographs may be wrong: "
-            f"{command('render', 'RUN', '--views', ','.join(far[:4]))} compares them "
+            f"{command('render', 'RUN', '--views', ','.join(poor[:4]))} compares them "
             "with the run; correct them or leave them out."
         )
     if exposed:
@@ -456,15 +456,17 @@ def warnings_of(views: Mapping[str, ViewHealth], unseen: float | None, limits: L
 
 def _exposed(views: Mapping[str, ViewHealth], limits: Limits) -> dict[str, float]:
     """Return the deviations of views with another exposure from the other views, in stops, the largest first."""
-    known = {name: torch.tensor(view.stops) for name, view in views.items() if view.stops is not None}
-    if len(known) <= NEIGHBORS:
+    stops_by_view = {name: torch.tensor(view.stops) for name, view in views.items() if view.stops is not None}
+    if len(stops_by_view) <= NEIGHBORS:
         return {}
-    stops = torch.stack(list(known.values()))
-    off = stops - stops.median(dim=0).values
-    least = max(limits.exposed, limits.scattered * TO_DEVIATION * float(off.abs().median()))
-    strongest = {name: max(row.tolist(), key=abs) for name, row in zip(known, off, strict=True)}
+    stops = torch.stack(list(stops_by_view.values()))
+    deviations = stops - stops.median(dim=0).values
+    threshold = max(limits.exposed, limits.scattered * TO_DEVIATION * float(deviations.abs().median()))
+    strongest = {
+        name: max(row.tolist(), key=abs) for name, row in zip(stops_by_view, deviations, strict=True)
+    }
     order = sorted(strongest, key=lambda name: -abs(strongest[name]))
-    return {name: strongest[name] for name in order if abs(strongest[name]) > least}
+    return {name: strongest[name] for name in order if abs(strongest[name]) > threshold}
 
 
 def _far_under(views: Mapping[str, ViewHealth], limits: Limits) -> list[str]:
@@ -475,8 +477,8 @@ def _far_under(views: Mapping[str, ViewHealth], limits: Limits) -> list[str]:
         if view.psnr is not None and view.beside is not None
     }
     scatter = TO_DEVIATION * median(map(abs, drops.values())) if drops else 0.0
-    least = max(limits.far, limits.scattered * scatter)
-    return sorted((name for name in drops if drops[name] > least), key=lambda name: -drops[name])
+    threshold = max(limits.far, limits.scattered * scatter)
+    return sorted((name for name in drops if drops[name] > threshold), key=lambda name: -drops[name])
 
 
 def _worst(shares: Mapping[str, float], of: str = "of the pixels") -> str:

@@ -104,28 +104,28 @@ def share_memory(
     """
     largest = max(pixels, default=0)
     total = sum(pixels)
-    now = resident_memory()
-    work = now + own
+    resident = resident_memory()
+    work = resident + own
     pictures = 0 if in_memory else (KEPT - MASKS) * total
     masks = 0 if in_memory else (MASKS - 3) * total
     # The decoded photograph of one view, and its targets.
     least = work + masks + (KEPT + of_view) * largest
-    least = max(least, now + PROCESS + MASKS * total + 4 * READ * largest)
-    whole = work + masks + pictures + of_view * total
+    least = max(least, resident + PROCESS + MASKS * total + 4 * READ * largest)
+    total_need = work + masks + pictures + of_view * total
     if limit is not None:
         allowed = int(limit * GIBIBYTE)
         if allowed < least:
             raise too_little(least, allowed, what, less)
     else:
-        allowed = now + int(SHARE * free_memory())
-    if whole <= allowed:
-        return MemoryPlan(True, None, whole)
+        allowed = resident + int(SHARE * free_memory())
+    if total_need <= allowed:
+        return MemoryPlan(True, None, total_need)
     filled = int(FILLED * allowed)
     hold = in_memory or (
         work + masks + pictures + of_view * largest <= filled and of_view * total <= pictures
     )
     room = filled - work - masks - (pictures if hold and not in_memory else KEPT * largest)
-    return MemoryPlan(hold, max(0, room), max(least, min(allowed, whole)))
+    return MemoryPlan(hold, max(0, room), max(least, min(allowed, total_need)))
 
 
 def pixels_of(folder: Path, downscale: int) -> list[int]:

@@ -169,19 +169,19 @@ def baked_harmonics(
         present: maps linear colors to displayed ones.
         linear: displayed colors are linear as well.
     """
-    known = {
+    parameters = {
         name: values
         for name in (*CORE_SHAPES, *shading.parameters)
         if (values := gaussians.get(name)) is not None
     }
-    means = known["means"].detach()
+    means = parameters["means"].detach()
     normals = shortest_axis_normals(
-        means, known["quaternions"].detach(), known["log_scales"].detach(), means.new_zeros(3)
+        means, parameters["quaternions"].detach(), parameters["log_scales"].detach(), means.new_zeros(3)
     )
 
     def colors(part: slice, directions: Tensor) -> Tensor:
-        some = {name: values.detach()[part] for name, values in known.items()}
-        return present(gaussian_colors(some, light, shading, directions))
+        batch = {name: values.detach()[part] for name, values in parameters.items()}
+        return present(gaussian_colors(batch, light, shading, directions))
 
     return refit_sh(colors, normals, srgb_slope if linear else None)
 

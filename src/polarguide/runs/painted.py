@@ -44,11 +44,11 @@ class PaintedMaterials:
         """Return a scene with these materials on labeled pixels."""
         views = []
         for view in scene.views:
-            own = view.materials
+            materials = view.materials
             painted = self.numbers.get(view.name)
             if painted is not None:
-                own = painted if own is None else torch.where(painted > 0, painted, own)
-            views.append(replace(view, materials=own))
+                materials = painted if materials is None else torch.where(painted > 0, painted, materials)
+            views.append(replace(view, materials=materials))
         return replace(scene, views=tuple(views))
 
 
@@ -63,22 +63,22 @@ def read_painted(run: Path, scene: Scene) -> PaintedMaterials | None:
         return None
     digest = hashlib.sha256()
     numbers = dict[str, Tensor]()
-    known = {0, 1, 2, *scene.indices}
+    defined = {0, 1, 2, *scene.indices}
     for name, path in sorted(index_files(run / FOLDER, SUFFIXES).items()):
         camera = scene.view(name).camera
         data = read_file(path, largest=LARGEST, remedy=REMEDY)
         picture = torch.from_numpy(decode_materials(path, data))
         size = (camera.height, camera.width)
-        found = tuple(picture.shape)
-        if found != size:
+        shape = tuple(picture.shape)
+        if shape != size:
             raise PolarguideError(
                 path,
                 expected=f"{camera.width}x{camera.height} pixels, the size of the training view",
-                found=f"{found[1]}x{found[0]}",
+                found=f"{shape[1]}x{shape[0]}",
                 remedy=REMEDY,
             )
-        if unknown := set(picture.unique().tolist()) - known:
-            listed = ", ".join(map(str, sorted(known)))
+        if unknown := set(picture.unique().tolist()) - defined:
+            listed = ", ".join(map(str, sorted(defined)))
             raise PolarguideError(
                 path, expected=f"the numbers {listed}", found=str(min(unknown)), remedy=REMEDY
             )

@@ -224,12 +224,12 @@ def unsuitable_folder(out: Path, resume: bool) -> PolarguideError | None:
         return error
     if os.path.lexists(out / CONFIGURATION) == resume:
         return None
-    expected, found, remedy = (
+    expected, actual, remedy = (
         ("a run to resume", "no run.json", "Train without --resume, or name the folder of a run.")
         if resume
         else ("a new folder", "a run", "Add --resume (resume=True) to continue it, or name another folder.")
     )
-    return PolarguideError(out, expected=expected, found=found, remedy=remedy)
+    return PolarguideError(out, expected=expected, found=actual, remedy=remedy)
 
 
 def check_trainable(scene: Scene) -> None:

@@ -66,13 +66,13 @@ def flat_surface(view: View, refractive_index: float, rules: FlatRules) -> Flat 
 
     pixels = good.numel()
     step = max(1, round((pixels / rules.samples) ** 0.5))
-    some = torch.zeros_like(good)
-    some[::step, ::step] = good[::step, ::step]
-    e = across[some]
-    d = rays[some]
-    dolp = degree[some]
-    least = rules.least * pixels / step**2
-    if len(e) < max(2.0, least):
+    sampled = torch.zeros_like(good)
+    sampled[::step, ::step] = good[::step, ::step]
+    e = across[sampled]
+    d = rays[sampled]
+    dolp = degree[sampled]
+    fewest = rules.least * pixels / step**2
+    if len(e) < max(2.0, fewest):
         return None
     pairs = torch.randint(len(e), (2, rules.tries), generator=torch.Generator().manual_seed(0))
     proposed = torch.linalg.cross(e[pairs[0]], e[pairs[1]])
@@ -88,7 +88,7 @@ def flat_surface(view: View, refractive_index: float, rules: FlatRules) -> Flat 
         _, vectors = torch.linalg.eigh(e[inside].T @ e[inside])
         normal = vectors[:, 0] * torch.sign(vectors[:, 0] @ normal)
         inside = _agrees(e @ normal, -(d @ normal), dolp, refractive_index, rules)
-    if float(inside.sum()) < least:
+    if float(inside.sum()) < fewest:
         return None
     everywhere = normal.expand_as(rays)
     where = good & _agrees(dot(across, everywhere), -dot(rays, everywhere), degree, refractive_index, rules)
@@ -206,8 +206,8 @@ def guide_normals(normal: Tensor, rays: Tensor, least: float) -> tuple[Tensor, T
     """
     reliable = dot(normal, normal) > least**2
     facing = unit(normal)
-    away = dot(facing, rays)[..., None].clamp(min=0)
-    return unit(facing - away * 1.001 * rays), reliable
+    overshoot = dot(facing, rays)[..., None].clamp(min=0)
+    return unit(facing - overshoot * 1.001 * rays), reliable
 
 
 @torch.no_grad()
@@ -346,8 +346,8 @@ def _by_color(
     chromatic = facing(zenith, azimuth, guide.normal, rays)
     weight = certainty * guide.shown
     if settings.chromatic_within is not None:
-        near = _within(chromatic, guide.normal, *settings.chromatic_within)
-        weight = weight * torch.maximum(near, colorful)
+        nearness = _within(chromatic, guide.normal, *settings.chromatic_within)
+        weight = weight * torch.maximum(nearness, colorful)
     chromatic = torch.where(guide.astray[..., None], guide.on_plane, chromatic)
     return chromatic, torch.maximum(weight, guide.astray.to(weight))
 
@@ -378,8 +378,8 @@ def _across(luminance: Tensor, normal: Tensor, rays: Tensor) -> Tensor:
 
 def _within(normal: Tensor, guide: Tensor, full: float, none: float) -> Tensor:
     """Return a weight [H, W] that falls with the angle of unit normals, from 1 at ``full`` to 0 at ``none`` degrees."""
-    off = torch.linalg.cross(normal, guide).norm(dim=-1).atan2(dot(normal, guide)).rad2deg()
-    return ((none - off) / (none - full)).clamp(0, 1)
+    angle = torch.linalg.cross(normal, guide).norm(dim=-1).atan2(dot(normal, guide)).rad2deg()
+    return ((none - angle) / (none - full)).clamp(0, 1)
 
 
 def _noise(view: View) -> Tensor | float:

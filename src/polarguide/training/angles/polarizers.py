@@ -234,8 +234,8 @@ class Judgment(FittedAngle):
 
     def resembles(self, other: Judgment) -> bool:
         """Return True if the fitted angle equals the specified angle of another picture, within its spread."""
-        apart = angle_difference(self.angle, other.specified.angle or 0.0)
-        return abs(apart) <= tolerance(self.rules.contradicts, self.spread)
+        difference = angle_difference(self.angle, other.specified.angle or 0.0)
+        return abs(difference) <= tolerance(self.rules.contradicts, self.spread)
 
     @property
     def doubtful(self) -> bool:
@@ -353,9 +353,9 @@ class Polarizers:
     def take(self, table: Tensor) -> set[str]:
         """Use a table of all fits [F, P, 8]; return the names of the views with changed exposures."""
         self.table = table
-        before = self.beliefs
+        earlier = self.beliefs
         self.beliefs = self._beliefs()
-        return {name for name, exposures in self.beliefs.items() if before.get(name) != exposures}
+        return {name for name, exposures in self.beliefs.items() if earlier.get(name) != exposures}
 
     def judgments(self) -> list[Judgment]:
         """Return the judgment of each picture; empty before the first fit."""
@@ -374,8 +374,8 @@ class Polarizers:
                 angles = [row.angle for row in telling]
                 spreads = [row.spread for row in telling]
                 angle, scatter = mean_angle(angles, spreads, self._rules.least_spread)
-                few = len(telling) < len(rows) / 2
-                judgment = replace(judgment, angle=angle, scatter=90.0 if few else scatter)
+                is_scattered = len(telling) < len(rows) / 2
+                judgment = replace(judgment, angle=angle, scatter=90.0 if is_scattered else scatter)
             if wrong := [row for row in rows if row.contradicts]:
                 judgment = replace(wrong[-1], unexplained=poor)
             judgments.append(

@@ -158,11 +158,11 @@ def contradicted(
     """
     opposed_shares = {}
     for view, kinds in memory.between(labeled_views(views)):
-        own = _labels_in(gaussians, view, kinds, rasterize)
-        others = (labels - own).clamp(min=0)
-        own = own * (others.sum(dim=1, keepdim=True) > LEAST_PIXELS)
-        opposed = (own * (others.flip(1) > others)).sum()
-        share = float(opposed / own.sum().clamp(min=1e-6))
+        labels_here = _labels_in(gaussians, view, kinds, rasterize)
+        other_labels = (labels - labels_here).clamp(min=0)
+        labels_here = labels_here * (other_labels.sum(dim=1, keepdim=True) > LEAST_PIXELS)
+        opposed = (labels_here * (other_labels.flip(1) > other_labels)).sum()
+        share = float(opposed / labels_here.sum().clamp(min=1e-6))
         if share > limits.contradicted:
             opposed_shares[view.name] = share
     return dict(sorted(opposed_shares.items(), key=lambda item: -item[1]))
@@ -220,13 +220,13 @@ def index_offsets(
     numbers = sorted(set().union(*labels.values()) & indices.keys())
     weights = means.new_zeros(len(means), 1 + len(numbers))
     for view, kinds in memory.between(labeled_views(views)):
-        here = [number for number in numbers if number in labels[view.name]]
-        columns = [0, *(1 + numbers.index(number) for number in here)]
-        masks = [(kinds == 1) | (kinds == 2), *(kinds == number for number in here)]
+        local_numbers = [number for number in numbers if number in labels[view.name]]
+        columns = [0, *(1 + numbers.index(number) for number in local_numbers)]
+        masks = [(kinds == 1) | (kinds == 2), *(kinds == number for number in local_numbers)]
         weights[:, columns] += _labeled(gaussians, view, kinds, masks, rasterize)
     offsets = means.new_tensor([0.0, *(indices[number] - refractive_index for number in numbers)])
-    most, chosen = weights.max(dim=1)
-    specified = torch.where(most > LEAST_SEEN, offsets[chosen], torch.zeros_like(most))
+    largest, chosen = weights.max(dim=1)
+    specified = torch.where(largest > LEAST_SEEN, offsets[chosen], torch.zeros_like(largest))
     metalness = gaussians.get("metalness")
     return specified if metalness is None else specified * (metalness < 1)
 

@@ -261,17 +261,17 @@ def neighbor_graph(gaussians: Parameters, measured: MetalEvidence, rules: MetalR
     )
     places = means.cpu().double().numpy()
     count = min(NEIGHBORS + 1, len(places))
-    near = torch.from_numpy(cKDTree(places).query(places, k=count)[1]).reshape(len(places), count)[:, 1:]
-    near = near.to(means.device)
+    neighbors = torch.from_numpy(cKDTree(places).query(places, k=count)[1]).reshape(len(places), count)[:, 1:]
+    neighbors = neighbors.to(means.device)
     logarithms = (measured.color + DARK).log()
-    apart = (logarithms[near] - logarithms[:, None]).square().mean(dim=-1)
+    differences = (logarithms[neighbors] - logarithms[:, None]).square().mean(dim=-1)
     visible = measured.views > 0
-    typical = (apart.mean(dim=1) * visible).sum() / visible.sum().clamp(min=1)
-    alike = dot(axes[:, None], axes[near]) ** 4 * torch.exp(-0.5 * apart / typical.clamp(min=1e-6))
+    typical = (differences.mean(dim=1) * visible).sum() / visible.sum().clamp(min=1)
+    alike = dot(axes[:, None], axes[neighbors]) ** 4 * torch.exp(-0.5 * differences / typical.clamp(min=1e-6))
     first = np.repeat(np.arange(len(places)), count - 1)
     # A pair of mutual neighbors appears twice.
     return Graph(
-        first, near.cpu().numpy().ravel(), (0.5 * rules.likeness * alike).cpu().double().numpy().ravel()
+        first, neighbors.cpu().numpy().ravel(), (0.5 * rules.likeness * alike).cpu().double().numpy().ravel()
     )
 
 
@@ -389,10 +389,10 @@ def light_gain(
     if not len(ratio) or len(ratio) < limits.gain_pixels * pixels:
         return 1.0
     body = gaussians["metalness"] == 0
-    least = (
+    smallest = (
         torch.quantile(shading.strength(gaussians)[body], 0.9) if bool(body.any()) else ratio.new_tensor(0.1)
     )
-    return float(ratio.median().exp().clamp(min=float(least), max=limits.most_gain))
+    return float(ratio.median().exp().clamp(min=float(smallest), max=limits.most_gain))
 
 
 class MetalSearch:
@@ -489,8 +489,8 @@ class MetalSearch:
         context = self._context
         means = state.gaussians["means"].detach()
         reach = context.recipe.metal_views.reach
-        far = far_away(means.cpu(), context.scene.points, context.centers, reach).to(means.device)
-        return ~far & any(view.is_determined for view in context.views)
+        is_far = far_away(means.cpu(), context.scene.points, context.centers, reach).to(means.device)
+        return ~is_far & any(view.is_determined for view in context.views)
 
     def _priors(self, step: int) -> tuple[float, ...]:
         """Return the shares of the prior at a step: several before the last search, for soft metalness.
