@@ -1,6 +1,6 @@
 """Polarizer angles as a training estimates them: unknown angles, and contradicted known ones.
 
-The angle and the gain of a picture behind a polarizer, in closed form from predicted Stokes vectors.
+The angle and the gain of a picture behind a polarizer follow in closed form from predicted Stokes vectors.
 """
 
 from __future__ import annotations
@@ -110,7 +110,7 @@ def fit_angle(
     if gain <= 0 or length == 0:
         return None
     covariance = _covariance(columns, plain, y - solution @ columns, intensity.shape)
-    if mount == "filter":  # turned into the last round's analyzer, which is all but along the first axis
+    if mount == "filter":  # in the analyzer of the last round, the second component is almost 0
         x = length
         y2 = 0.0
     across = torch.tensor([0.0, -y2, x], dtype=torch.float64) / length
@@ -344,16 +344,16 @@ class Polarizers:
     def take(self, table: Tensor) -> set[str]:
         """Use a table of all fits [F, P, 8]; return the names of the views with changed exposures."""
         self.table = table
-        before = self.beliefs
+        earlier = self.beliefs
         self.beliefs = self._beliefs()
-        return {name for name, exposures in self.beliefs.items() if before.get(name) != exposures}
+        return {name for name, exposures in self.beliefs.items() if earlier.get(name) != exposures}
 
     def judgments(self) -> list[Judgment]:
         """Return the judgment of each picture; empty before the first fit."""
         if self.table is None:
             return []
         common = self._common_gain(self.table[-1])
-        # The fits of the latest search that has any; those of earlier ones are worse.
+        # Fits of the latest search only, because earlier ones are worse.
         ends = itertools.accumulate(map(len, self._rounds), initial=0)
         latest = self.table[max(end for end in ends if end < len(self.table)) :]
         fits = zip(*map(self._judged, latest), strict=True)
@@ -365,8 +365,8 @@ class Polarizers:
                 angles = [row.angle for row in telling]
                 spreads = [row.spread for row in telling]
                 angle, scatter = mean_angle(angles, spreads, self._rules.least_spread)
-                few = len(telling) < len(rows) / 2
-                judgment = replace(judgment, angle=angle, scatter=90.0 if few else scatter)
+                is_scattered = len(telling) < len(rows) / 2
+                judgment = replace(judgment, angle=angle, scatter=90.0 if is_scattered else scatter)
             if wrong := [row for row in rows if row.contradicts]:
                 judgment = replace(wrong[-1], unexplained=poor)
             judgments.append(
