@@ -177,7 +177,7 @@ def test_rows_stay_leaves_that_train_after_every_edit() -> None:
 
 def test_tensors_of_different_length_are_refused() -> None:
     uneven = {**tensors(), "side": torch.zeros(COUNT - 1, 2)}
-    Fault("Gaussians", "as many in every tensor").raised_by(Gaussians, uneven, RATES)
+    Fault("Gaussians", "same number").raised_by(Gaussians, uneven, RATES)
 
 
 ELLIPSOIDS = 50

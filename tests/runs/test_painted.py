@@ -65,16 +65,14 @@ def test_paint_on_a_held_out_view_is_refused(scene: polarguide.Scene, tmp_path: 
     write_painted(tmp_path, {**pictures(scene), test.name: blank})
     assert read_painted(tmp_path, scene) is not None  # says nothing
     write_painted(tmp_path, {test.name: blank + 2})
-    Fault(f"{test.name}.png", "a view that is trained on", "held out").raised_by(
-        read_painted, tmp_path, scene
-    )
+    Fault(f"{test.name}.png", "a training view", "held out").raised_by(read_painted, tmp_path, scene)
 
 
 @pytest.mark.parametrize(
     ("name", "picture", "fault"),
     [
         ("stranger", np.zeros((2, 2), np.uint8), Fault("", "of the 14 views", "stranger")),
-        ("v000", np.zeros((7, 9), np.uint8), Fault("v000.png", "pixels, as the view was trained", "9x7")),
+        ("v000", np.zeros((7, 9), np.uint8), Fault("v000.png", "size of the training view", "9x7")),
         ("v000", None, Fault("v000.png", "the numbers 0, 1, 2", "3")),
     ],
 )

@@ -236,7 +236,7 @@ def test_every_term_reads_targets_and_layers_that_there_are() -> None:
         alone = Weights(**{"photometric": 0.0, weight.name: 1.0})
         assert alone.fields_read <= known, weight.name
         assert {*weight.metadata["rendered"]} <= {"normal", "depth", "layers"}, weight.name
-        assert alone.normals == ("normal" in weight.metadata["rendered"]), weight.name
+        assert alone.rendered == {*weight.metadata["rendered"]}, weight.name
         # Priors are computed for the terms that need them; a term that can do without them is marked as optional.
         assert alone.priors == (bool(weight.metadata["priors"]) and not weight.metadata["optional"]), (
             weight.name
@@ -399,5 +399,5 @@ def test_a_term_of_another_package_is_in_the_loss():
     plain, *_ = step_loss(step(rendered, shown, None), Weights())
     more, *_ = step_loss(step(rendered, shown, None), MoreWeights(brightness=2.0))
     assert_close(more - plain, 2.0 * rendered.final.mean())
-    assert MoreWeights(brightness=2.0).layers
-    assert not MoreWeights().layers
+    assert "layers" in MoreWeights(brightness=2.0).rendered
+    assert "layers" not in MoreWeights().rendered

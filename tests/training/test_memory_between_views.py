@@ -13,8 +13,8 @@ from polarguide.core.system import MemoryBound
 from polarguide.raster.cpu import rasterize_cpu
 from polarguide.training import priors
 from polarguide.training.callbacks import outward_directions
-from polarguide.training.metals.evidence import evidence
 from polarguide.training.metals.observations import contradicted, label_weights
+from polarguide.training.metals.search import evidence
 from polarguide.training.recipe import MetalRules, MetalViews
 
 RULES, LIMITS = MetalRules(), MetalViews()

@@ -22,18 +22,23 @@ from polarguide.optics.fresnel import reflectances_from_cosine
 from polarguide.raster.cpu import rasterize_cpu
 from polarguide.recipes import RECIPES
 from polarguide.runs.folder import load_checkpoint, save_checkpoint
+from polarguide.runs.health import METALS_PICTURE, report_metals
 from polarguide.runs.model import GaussianModel
-from polarguide.runs.reports import METALS_PICTURE, report_metals
 from polarguide.training.angles.fits import gaussian_training
 from polarguide.training.loop import TrainingLoop
-from polarguide.training.metals.evidence import GOLD, LEVELS, MetalEvidence, _tint_cost, errors, evidence
 from polarguide.training.metals.observations import ViewSamples, contradicted, label_weights, shares
 from polarguide.training.metals.search import (
+    GOLD,
     INFINITE,
+    LEVELS,
     SOFT_PRIORS,
     Graph,
+    MetalEvidence,
     MetalSearch,
+    _tint_cost,
     decide,
+    errors,
+    evidence,
     looks,
     minimum_cut,
     surfaces,

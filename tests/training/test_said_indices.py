@@ -136,7 +136,7 @@ def test_what_was_measured_is_separated_with_the_index_of_each_pixel(run: polarg
 @pytest.mark.parametrize(
     ("recipe", "left", "message"),
     [
-        ("3dgs-dr", 3, "the recipe 3dgs-dr takes the run's for everything"),
+        ("3dgs-dr", 3, "the recipe 3dgs-dr uses that of the run"),
         ("polarguide-stokes:unpolarized", 3, "the recipe polarguide-stokes:unpolarized takes"),
         ("polarguide-stokes", 1, "no picture in materials/ of a training view has one of their numbers"),
         ("polarguide-stokes", 3, ""),

@@ -1,1 +1,1 @@
-"""The Python interface, as ``import polarguide`` gives it: captures, and runs."""
+"""The Python interface, as ``import polarguide`` offers it: captures, and runs."""

@@ -1,4 +1,4 @@
-"""Functions of the Python interface on captures. A training does not import them and begins sooner."""
+"""Functions of the Python interface on captures; a training does not import them, and begins sooner."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ def inspect(
     device: DeviceName = "auto",
     reporter: Reporter = SILENT,
 ) -> Inspection:
-    """Find what is right and wrong with a capture; writes a page and a record.
+    """Check a capture; writes a page and a record.
 
     Args:
         scene: the scene folder; it may have no poses.
-        out: folder to write; SCENE-inspection beside the scene by default.
-        settings: how to inspect.
-        device: what its short training computes on.
+        out: folder to write; None: SCENE-inspection next to the scene.
+        settings: settings of the inspection.
+        device: device of its short training.
         reporter: receives progress.
 
     Raises:

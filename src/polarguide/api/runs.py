@@ -1,6 +1,6 @@
 """Functions of the Python interface on runs. The command line is a client of it.
 
-Nothing here prints or installs signal handlers: progress and messages go to a ``Reporter``.
+Functions here do not print and install no signal handlers: progress and messages go to a ``Reporter``.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ from polarguide.training.settings import TrainSettings
 from polarguide.viewer import server
 
 _PICTURED = 3
-"""Views that a notebook shows of a run: each is drawn."""
+"""Number of rendered views in the representation of a run in a notebook."""
 
 
 class Run(OpenedRun):
     """A trained run: its layers from any camera, and everything that can be made of it.
 
-    ``polarguide.train`` and ``polarguide.open_run`` give one.
+    ``polarguide.train`` and ``polarguide.open_run`` return one.
 
     Example:
         >>> run = polarguide.open_run("runs/demo")                       # doctest: +SKIP
@@ -53,28 +53,28 @@ class Run(OpenedRun):
     write_pictures = pictures.write_pictures
 
     def metrics(self) -> Mapping[str, Any]:
-        """The record that ``evaluate`` wrote: means over the test views, and ``views`` by name.
+        """Return the record of ``evaluate``: means over the test views, and ``views`` by name.
 
         Raises:
-            PolarguideError: the run has not been scored, or the file is not such a record.
+            PolarguideError: the run has no scores, or the file is not such a record.
         """
         return read_metrics(self.folder)
 
     def _repr_html_(self) -> str:
-        """For notebooks: held-out views as drawn, counts, and the verdicts of health and scores."""
+        """Return rendered held-out views, counts, health and scores, for notebooks."""
         facts = {"run": str(self), "polarization": self._evidence()}
         pictures = ""
-        try:  # a run's scene may have moved, and its records may be damaged; the rest is there
+        try:  # the scene may have moved, and records may be damaged
             views = self.scene.test_views or self.scene.views
             for view in views[:_PICTURED]:
                 drawn = self.render(view.camera)["final"]
-                pictures += figure(drawn.cpu().numpy(), f"{view.name}, as drawn")
+                pictures += figure(drawn.cpu().numpy(), f"{view.name}, rendered")
             health = self.health
             facts["warnings"] = "\n".join(health.warnings) or "none" if health is not None else "not recorded"
             scores = shown_metrics(self.metrics(), scores_only=True)
             facts["scores"] = "\n".join(f"{label}: {text}" for label, text in scores)
         except PolarguideError as error:
-            facts["not there"] = str(error)
+            facts["error"] = str(error)
         return f"{pictures}{table(self.folder.name, facts)}"
 
 
@@ -102,8 +102,9 @@ def train(
         31.4
 
     Raises:
-        PolarguideError: wrong input, or a folder that does not suit.
-        KeyboardInterrupt: it was stopped; the state is saved, and ``resume=True`` goes on to the same result.
+        PolarguideError: wrong input, or an unsuitable folder.
+        KeyboardInterrupt: the training was stopped. The state is saved, and ``resume=True`` continues to the same
+            result.
     """
 
     looking = partial(
@@ -130,14 +131,14 @@ def train(
 
 
 def demo_scene() -> Path:
-    """The folder of the small scene that ships with the package: glossy objects, 50 views, four angles each.
+    """Return the folder of the small scene of the package: glossy objects, 50 views, four angles each.
 
     Example:
         >>> polarguide.load_scene(polarguide.demo_scene()).view("v000").camera.width    # doctest: +SKIP
         128
 
     Raises:
-        PolarguideError: the package is not whole.
+        PolarguideError: the package is incomplete.
     """
     scene = Path(__file__).parents[1] / "data" / "demo"
     require_folder(scene, expected="the demo scene", remedy="Install the package again.")

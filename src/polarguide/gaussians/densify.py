@@ -1,7 +1,7 @@
-"""Adaptive density control (Kerbl et al. 2023, Sec. 5.2): clone, split and prune, and the statistics they need.
+"""Adaptive density control (Kerbl et al. 2023, Sec. 5.2): clone, split and prune, and their statistics.
 
 Free space, just in front of the cameras, has no surface. A Gaussian close to one camera explains that one picture and
-occludes every new view nearby. The SfM points bound the distance of the nearest surface of a view; well before it,
+occludes every new view nearby. The SfM points bound the distance of the nearest surface of a view, in front of which
 space is free.
 """
 
@@ -23,26 +23,30 @@ class FreeSpace:
     """Balls about the cameras.
 
     Attributes:
-        centers: [V, 3]. radii: [V], 0 for a camera that sees no point.
+        centers: [V, 3] camera centers.
+        radii: [V], 0 for a camera that sees no point.
     """
 
     centers: Tensor
     radii: Tensor
 
     def to(self, device: torch.device) -> FreeSpace:
-        """The same free space on a device."""
+        """Return the free space on a device."""
         return FreeSpace(self.centers.to(device), self.radii.to(device))
 
     def contains(self, means: Tensor) -> Tensor:
-        """Which of the positions [N, 3] lie in it, [N] bool."""
+        """Return a mask [N] of the positions [N, 3] inside."""
         return (torch.cdist(means, self.centers) < self.radii).any(dim=1)
 
 
 def free_space(points: Tensor, cameras: Sequence[Camera], share: float, quantile: float) -> FreeSpace:
-    """The free space in front of cameras that see SfM points [M, 3].
+    """Return the free space in front of cameras that see SfM points [M, 3].
 
     Args:
-        share: share of the depth of a view's nearest points, which is free. quantile: of depths, which is the nearest.
+        points: [M, 3] SfM points.
+        cameras: the cameras.
+        share: free share of the depth of a view's nearest points.
+        quantile: quantile of the depths that counts as the nearest.
     """
     radii = []
     for camera in cameras:
@@ -62,24 +66,24 @@ class Densification:
 
     Attributes:
         every: steps between two rounds.
-        gradient: mean gradient of the loss with respect to the projected mean, in units of half a picture, above
-            which a Gaussian is cloned or split.
-        dense_share: a Gaussian wider than this share of the scene's extent is split, a smaller one cloned.
-        minimum_opacity: below it a Gaussian is pruned.
-        maximum_scale_share: within the extent, wider than this share of it is pruned.
-        far_scale_share: beyond it, wider than this share of the distance; a little more than the widest of the shell
-            with which the surroundings begin (``Initialization``).
-        large_from: share of all steps after which huge Gaussians are pruned: 3,000 of 30,000 in the release, where it
-            is the interval of the opacity resets. large_minimum: and never before this step.
-        pixels_each: least number of pixels, of all training pictures, for each Gaussian. A Gaussian has some sixty
+        gradient: mean gradient of the loss with respect to the projected mean, in units of half a picture, above which
+            a Gaussian is cloned or split.
+        dense_share: share of the scene's extent above which a Gaussian is split; smaller ones are cloned.
+        minimum_opacity: opacity below which a Gaussian is pruned.
+        maximum_scale_share: share of the extent above which Gaussians within it are pruned.
+        far_scale_share: share of the distance above which Gaussians beyond the extent are pruned; a little more than
+            the widest of the initial shell of the surroundings (``Initialization``).
+        large_from: share of all steps after which huge Gaussians are pruned: 3,000 of 30,000 in the release, which is
+            the interval of its opacity resets.
+        large_minimum: least step at which they are pruned.
+        pixels_each: least number of pixels, of all training pictures, for each Gaussian. A Gaussian has about sixty
             parameters and a pixel three values: with fewer than twenty pixels each, unknowns outnumber data.
-        faint_pixels: Gaussians go, once, when the density control ends, whose blending weights add up to less than this
-            in every training picture: three in ten, which cost time and show nothing. 0: none goes.
-        enough_views: number of training views from which on, before an empty background, Gaussians go that only one
-            of them sees.
-        reset_opacity: what a reset lowers opacities to (Kerbl et al. 2023).
-        free_share: no Gaussian stays within this share of the depth of a view's nearest points
-            (``gaussians.densify``). free_quantile: quantile of the points' depths, which counts as the nearest.
+        faint_pixels: least sum of the blending weights of a Gaussian in some training picture, at the end of the
+            density control. Others are pruned: three in ten, which take time and are invisible. 0: none is pruned.
+        enough_views: number of training views above which Gaussians in only one view are pruned, without a background.
+        reset_opacity: opacity after a reset (Kerbl et al. 2023).
+        free_share: free share of the depth of a view's nearest points (``gaussians.densify``).
+        free_quantile: quantile of the points' depths that counts as the nearest.
     """
 
     every: int = 100
@@ -98,19 +102,21 @@ class Densification:
     free_quantile: float = 0.02
 
     def prunes_large(self, step: int, steps: int) -> bool:
-        """Whether a round after a number of steps, of ``steps`` in all, prunes huge Gaussians."""
+        """Return True if the round after a step, of ``steps`` in all, prunes huge Gaussians."""
         return step >= max(self.large_minimum, self.large_from * steps)
 
 
 class DensityStatistics:
-    """Sums of the screen-space gradient norms over the pictures in which each Gaussian was seen.
+    """Sums of the screen-space gradient norms over the pictures in which each Gaussian was visible.
 
-    With several views a step, the first view of each step adds to the first of several sums, and so on; these are
-    added up in order when the mean is taken. So processes that share a step's views exchange sums only then, and the
-    result does not depend on the number of processes.
+    With several views per step, each view of a step has its own sums, which are added in order for the mean. Processes
+    that share the views of a step therefore exchange sums only for the mean, and the result does not depend on the
+    number of processes.
 
     Args:
-        count: N, of the Gaussians. slots: S, views a step. device: device of the Gaussians.
+        count: number N of Gaussians.
+        slots: number S of views per step.
+        device: device of the Gaussians.
 
     Attributes:
         gradient, seen: sums, [N], or [S, N] for more than one slot.
@@ -123,14 +129,21 @@ class DensityStatistics:
 
     @classmethod
     def of(cls, gradient: Tensor, counts: Tensor) -> DensityStatistics:
-        """From sums as of the attributes."""
+        """Return statistics with these sums."""
         statistics = cls(0, gradient.shape[0] if gradient.ndim == 2 else 1, gradient.device)
         statistics.gradient = gradient
         statistics.seen = counts
         return statistics
 
     def add(self, screen_gradient: Tensor, radii: Tensor, width: int, height: int, slot: int = 0) -> None:
-        """Add one picture. screen_gradient: [N, 2] per pixel, converted to units of half a picture."""
+        """Add one picture.
+
+        Args:
+            screen_gradient: [N, 2] per pixel; converted to units of half a picture.
+            radii: [N], 0 for invisible Gaussians.
+            width, height: size of the picture.
+            slot: slot of the view.
+        """
         x, y = screen_gradient.unbind(1)
         norm = torch.stack((x * (width / 2), y * (height / 2)), dim=1).norm(dim=1)
         gradient, counts = (t[slot] if t.ndim == 2 else t for t in (self.gradient, self.seen))
@@ -138,18 +151,18 @@ class DensityStatistics:
         counts += (radii > 0).to(counts)
 
     def mean(self) -> Tensor:
-        """Mean gradient norm, [N]; 0 where never seen."""
+        """Return the mean gradient norm, [N]; 0 for invisible Gaussians."""
         gradient, counts = (_in_order(t) for t in (self.gradient, self.seen))
         return gradient / counts.clamp(min=1)
 
     def clear(self, count: int) -> None:
-        """Start again with ``count`` Gaussians."""
+        """Reset the sums for ``count`` Gaussians."""
         shape = (count,) if self._slots == 1 else (self._slots, count)
         self.gradient, self.seen = (torch.zeros(shape, device=self._device) for _ in range(2))
 
 
 def _in_order(sums: Tensor) -> Tensor:
-    """Sums [S, N] added up in order; [N] as they are."""
+    """Add sums [S, N] in order; return [N] unchanged."""
     if sums.ndim == 1:
         return sums
     total = sums[0]
@@ -171,13 +184,17 @@ def densify(
     limit: int,
     generator: torch.Generator,
 ) -> None:
-    """One round: clone small Gaussians with a large gradient, split large ones, prune transparent and huge ones.
+    """Do one round: clone small Gaussians with a large gradient, split large ones, prune transparent and huge ones.
 
     Args:
-        extent: the scene's extent (``scene_extent``). middle: [3], the cameras' mean position.
-        prune_large: also prune the huge ones (``Densification.prunes_large``).
-        empty: space in which Gaussians are pruned, too.
-        limit: the largest number of Gaussians.
+        gaussians: the Gaussians.
+        statistics: sums since the previous round; reset.
+        settings: thresholds.
+        extent: the scene's extent (``scene_extent``).
+        middle: [3], the cameras' mean position.
+        prune_large: prune huge Gaussians (``Densification.prunes_large``).
+        empty: space in which Gaussians are pruned.
+        limit: largest number of Gaussians.
         generator: draws the positions of the children.
     """
     pulled = statistics.mean() >= settings.gradient
@@ -210,12 +227,12 @@ def densify(
 
 
 def _children(gaussians: Gaussians, split: Tensor, generator: torch.Generator) -> dict[str, Tensor]:
-    """Two children for each split Gaussian: drawn from it, 1.6 times smaller."""
+    """Return two children for each split Gaussian: drawn from it, 1.6 times smaller."""
     values = {
         name: gaussians[name].detach()[split].repeat(2, *[1] * (gaussians[name].ndim - 1))
         for name in gaussians.names
     }
-    # Drawn on the CPU, so that every device gets the same children.
+    # Drawn on the CPU: the children are the same on every device.
     drawn = torch.randn(values["means"].shape, generator=generator).to(values["means"].device)
     offsets = drawn * values["log_scales"].exp()
     rotations = quaternions_to_rotations(values["quaternions"])

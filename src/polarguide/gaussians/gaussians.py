@@ -1,12 +1,8 @@
-"""The Gaussians in training: tensors with one entry per Gaussian, and the moments of Adam, which follow them.
+"""Gaussians in training: tensors with one entry per Gaussian, and the moments of Adam (Kingma and Ba 2015).
 
-Gaussians are removed, appended and overwritten only through the methods here, so a tensor and its moments cannot get
-out of step.
-
-Adam (Kingma and Ba 2015) on named tensors.
-
-The kernel is torch's. ``torch.optim.Adam`` around it loads torch's compiler at its first use, which takes as long as
-loading torch itself, in every process that trains; and its state hangs on tensors, where ours change under way.
+Gaussians are removed, appended and overwritten only through the methods here, so that a tensor and its moments stay
+consistent. The kernel of Adam is torch's. ``torch.optim.Adam`` would load torch's compiler at its first use, which
+takes as long as loading torch, in every training; and its state belongs to tensors, which are replaced here.
 """
 
 from __future__ import annotations
@@ -21,19 +17,20 @@ from torch.optim.adam import adam
 from polarguide.core.errors import PolarguideError
 
 MOMENTS = ("step", "exp_avg", "exp_avg_sq")
-"""Names of a tensor's state: how many steps it has made, and the means of its gradients and their squares."""
+"""Names of a tensor's state: number of steps, and the means of its gradients and of their squares."""
 
 
 class Adam:
-    """The state of Adam, and its steps.
+    """State and steps of Adam.
 
     Args:
         rates: learning rate by name of the tensor; others are not trained.
-        betas: decay of both moments. epsilon: added to the root of the second moment.
+        betas: decay of both moments.
+        epsilon: addition to the root of the second moment.
 
     Attributes:
-        rates, betas: as above; they may be changed between steps.
-        moments: by name of the tensor, tensors by ``MOMENTS``; none before its first step.
+        rates, betas: as above; they may change between steps.
+        moments: tensors of ``MOMENTS`` by name of the tensor; empty before its first step.
     """
 
     def __init__(
@@ -46,7 +43,7 @@ class Adam:
 
     @torch.no_grad()
     def step(self, tensors: Mapping[str, Tensor]) -> None:
-        """One step of every trained tensor that has a gradient, in place; then the gradients are dropped."""
+        """Do one step of every trained tensor with a gradient, in place, and drop the gradients."""
         for name, rate in self.rates.items():
             tensor = tensors[name]
             if tensor.grad is None:
@@ -77,14 +74,13 @@ class Adam:
             tensor.grad = None
 
     def change(self, name: str, follow: Callable[[Tensor], Tensor]) -> None:
-        """Edit both moments of a tensor, where it has any, as the tensor itself was edited."""
+        """Apply an edit of a tensor to both of its moments, if it has any."""
         if name in self.moments:
             moments = self.moments[name]
             for key in ("exp_avg", "exp_avg_sq"):
                 moments[key] = follow(moments[key]).contiguous()
 
 
-# What every recipe trains, with the shape of one Gaussian's values. A shading model adds parameters of its own.
 CORE_SHAPES = {
     "means": (3,),
     "quaternions": (4,),
@@ -93,8 +89,9 @@ CORE_SHAPES = {
     "sh_dc": (3,),
     "sh_rest": (15, 3),
 }
-# The direction from which training views see a Gaussian; not trained, and only where a recipe is oriented.
+"""Shape of one Gaussian's values for the tensors of every recipe; a shading model adds its own."""
 ORIENTED_SHAPES = {"outward": (3,)}
+"""The direction from which training views see a Gaussian, for oriented recipes; not trained."""
 
 
 class Parameters(Protocol):
@@ -102,7 +99,7 @@ class Parameters(Protocol):
 
     def __getitem__(self, name: str, /) -> Tensor: ...
     def get(self, name: str, /) -> Tensor | None:
-        """The tensor, or None if there is none of that name."""
+        """Return a tensor, or None for an unknown name."""
 
 
 Own = TypeVar("Own", bound="Trained")
@@ -112,12 +109,12 @@ class Trained:
     """Named tensors with ``Adam``, whose epsilon is 1e-15 as in 3DGS.
 
     Args:
-        tensors: by name.
-        rates: learning rate by name; a name without one is not trained.
+        tensors: tensors by name.
+        rates: learning rate by name; tensors without a rate are not trained.
     """
 
     kind = ""
-    """What the names in a checkpoint begin with."""
+    """Prefix of the names in a checkpoint."""
 
     def __init__(self, tensors: Mapping[str, Tensor], rates: Mapping[str, float]) -> None:
         self._tensors = {
@@ -127,12 +124,12 @@ class Trained:
         self._adam = Adam(own, epsilon=1e-15)
 
     def trained(self) -> list[Tensor]:
-        """The tensors that are trained, in the order of their rates."""
+        """Return the trained tensors, in the order of their rates."""
         return [self._tensors[name] for name in self._adam.rates]
 
     @property
     def rates(self) -> dict[str, float]:
-        """Learning rate by name of the tensors that are trained."""
+        """Learning rates of the trained tensors by name."""
         return dict(self._adam.rates)
 
     @property
@@ -141,7 +138,7 @@ class Trained:
         return self._adam.betas
 
     def set_betas(self, betas: tuple[float, float]) -> None:
-        """Set the decay of Adam's moments; 0.9 and 0.999 otherwise."""
+        """Set the decay of Adam's moments, which is 0.9 and 0.999 by default."""
         self._adam.betas = betas
 
     def set_rate(self, name: str, rate: float) -> None:
@@ -150,11 +147,11 @@ class Trained:
             self._adam.rates[name] = rate
 
     def step(self) -> None:
-        """One Adam step on every tensor that has a gradient; then the gradients are dropped."""
+        """Do one Adam step of every tensor with a gradient, and drop the gradients."""
         self._adam.step(self._tensors)
 
     def state(self) -> dict[str, Tensor]:
-        """Everything needed to go on: ``KIND.NAME``, and the moments ``exp_avg``, ``exp_avg_sq`` and ``step``."""
+        """Return the tensors ``KIND.NAME``, and their moments ``exp_avg``, ``exp_avg_sq`` and ``step``."""
         out = {f"{self.kind}.{name}": t.detach().contiguous() for name, t in self._tensors.items()}
         for name, moments in self._adam.moments.items():
             for key, value in moments.items():
@@ -163,7 +160,7 @@ class Trained:
 
     @classmethod
     def from_state(cls: type[Own], state: Mapping[str, Tensor], rates: Mapping[str, float]) -> Own:
-        """The inverse of ``state``."""
+        """Return the tensors and moments of ``state``."""
         named = {tuple(key.split(".")): value for key, value in state.items()}
         loaded = cls({k[1]: value for k, value in named.items() if k[0] == cls.kind and len(k) == 2}, rates)
         for name in loaded._adam.rates:
@@ -175,7 +172,7 @@ class Trained:
 
     @staticmethod
     def _moments(name: str) -> str:
-        """The prefix of the names of a tensor's moments."""
+        """Return the prefix of the names of a tensor's moments."""
         return f"adam.{name}."
 
 
@@ -183,8 +180,8 @@ class Gaussians(Trained):
     """Named per-Gaussian tensors with their Adam moments.
 
     Args:
-        tensors: all with the same first axis; those of ``CORE_SHAPES`` and any others.
-        rates: learning rate by name; a name without one is not trained.
+        tensors: those of ``CORE_SHAPES`` and others, all with the same first axis.
+        rates: learning rate by name; tensors without a rate are not trained.
     """
 
     kind = "gaussians"
@@ -199,9 +196,9 @@ class Gaussians(Trained):
         if len(set(counts.values())) > 1:
             raise PolarguideError(
                 "Gaussians",
-                expected="as many in every tensor",
+                expected="the same number in every tensor",
                 found=str(counts),
-                remedy="Give every tensor one entry for each Gaussian.",
+                remedy="Use one entry per Gaussian in every tensor.",
             )
 
     def __len__(self) -> int:
@@ -211,11 +208,11 @@ class Gaussians(Trained):
         return self._tensors[name]
 
     def get(self, name: str) -> Tensor | None:
-        """The tensor, or None if there is none of that name."""
+        """Return a tensor, or None for an unknown name."""
         return self._tensors.get(name)
 
     def any_nonzero(self, name: str) -> bool:
-        """Return whether a tensor that is not trained has a value other than 0; False without such a tensor.
+        """Return True if an untrained tensor has a value other than 0; False without such a tensor.
 
         The device is read once between two changes of the tensor.
         """
@@ -229,11 +226,11 @@ class Gaussians(Trained):
         return tuple(self._tensors)
 
     def only(self, mask: Tensor) -> dict[str, Tensor]:
-        """All tensors of some Gaussians, [N] bool, detached."""
+        """Return all tensors of the Gaussians of a mask [N], detached."""
         return {name: t.detach()[mask] for name, t in self._tensors.items()}
 
     def snapshot(self) -> dict[str, Tensor]:
-        """Detached copies of all tensors."""
+        """Return detached copies of all tensors."""
         return {name: t.detach().clone() for name, t in self._tensors.items()}
 
     @torch.no_grad()
@@ -241,8 +238,9 @@ class Gaussians(Trained):
         """Replace a tensor's values and zero its moments, as 3DGS does at every reset.
 
         Args:
-            values: values of all Gaussians, also where ``rows`` chooses among them.
-            rows: [N] bool, those whose values are replaced and whose moments are zeroed; all, if not given.
+            name: name of the tensor.
+            values: values of all Gaussians, also if ``rows`` selects some.
+            rows: [N] bool, Gaussians whose values are replaced and whose moments are zeroed; None: all.
         """
         self._nonzero.pop(name, None)
         tensor = self._tensors[name]
@@ -256,17 +254,17 @@ class Gaussians(Trained):
         self._adam.change(name, zeroed)
 
     def keep(self, index: Tensor) -> None:
-        """Keep only the Gaussians that ``index`` (a mask or indices) selects."""
+        """Remove all Gaussians except those of ``index``, a mask or indices."""
         self._replace({name: t.detach()[index] for name, t in self._tensors.items()}, lambda m: m[index])
 
     def append(self, gaussians: Mapping[str, Tensor]) -> None:
-        """Append Gaussians, given by every tensor; their moments start at zero."""
+        """Append Gaussians with values of all tensors and zero moments."""
         joined = {name: torch.cat((t.detach(), gaussians[name])) for name, t in self._tensors.items()}
         count = gaussians["means"].shape[0]
         self._replace(joined, lambda m: torch.cat((m, m.new_zeros(count, *m.shape[1:]))))
 
     def _replace(self, tensors: Mapping[str, Tensor], follow: Callable[[Tensor], Tensor]) -> None:
-        """Put other values in the tensors' place; ``follow`` makes the same edit on a moment."""
+        """Replace tensors; ``follow`` makes the same edit of a moment."""
         self._nonzero.clear()
         for name, values in tensors.items():
             self._tensors[name] = values.contiguous().requires_grad_()
@@ -275,7 +273,7 @@ class Gaussians(Trained):
 
 
 def any_nonzero(gaussians: Parameters, name: str) -> bool:
-    """Return whether a tensor that is not trained has a value other than 0; False without such a tensor."""
+    """Return True if an untrained tensor has a value other than 0; False without such a tensor."""
     if isinstance(gaussians, Gaussians):
         return gaussians.any_nonzero(name)
     values = gaussians.get(name)

@@ -13,12 +13,12 @@ from polarguide import _native
 from polarguide.core.native import fits
 from polarguide.geometry.vectors import dot, unit
 
-# Cosine of the angle to the camera under which the outward side decides, not the camera.
 GRAZING = 0.35
+"""Cosine of the angle to the camera below which the outward side decides, not the camera."""
 
 
 def quaternions_to_rotations(quaternions: Tensor) -> Tensor:
-    """Rotation matrices [..., 3, 3] of quaternions (w, x, y, z) [..., 4], normalized first."""
+    """Return rotation matrices [..., 3, 3] of quaternions (w, x, y, z) [..., 4], which are normalized first."""
     w, x, y, z = normalize(quaternions, dim=-1, eps=1e-12).unbind(-1)
     entries = (
         (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
@@ -31,7 +31,7 @@ def quaternions_to_rotations(quaternions: Tensor) -> Tensor:
 def shortest_axis_normals_reference(
     means: Tensor, quaternions: Tensor, log_scales: Tensor, center: Tensor, outward: Tensor | None = None
 ) -> Tensor:
-    """The reference implementation of ``shortest_axis_normals``: plain torch, any dtype and device."""
+    """Compute ``shortest_axis_normals`` in plain torch: the reference implementation, for any dtype and device."""
     # Component by component: reductions over three or four, and one-hot vectors, are several times slower.
     w, x, y, z = quaternions.unbind(-1)
     first, second, third = log_scales.detach().unbind(-1)
@@ -57,7 +57,7 @@ def shortest_axis_normals_reference(
         facing = dot(to_camera, normals)
         if outward is not None:
             side = dot(outward, normals)
-            # Opaque surfaces that are seen do not face away, but for the width of their Gaussians.
+            # Visible opaque surfaces face the camera, up to the width of their Gaussians.
             grazing = facing.square() < GRAZING**2 * dot(to_camera, to_camera)
             facing = torch.where(grazing & (side != 0), side, facing)
         sign = torch.where(facing >= 0, 1.0, -1.0).to(normals)[:, None]
@@ -95,14 +95,17 @@ class _Axes(torch.autograd.Function):
 def shortest_axis_normals(
     means: Tensor, quaternions: Tensor, log_scales: Tensor, center: Tensor, outward: Tensor | None = None
 ) -> Tensor:
-    """Unit normals of flat Gaussians: the axis of the smallest scale, turned outward.
+    """Return unit normals of flat Gaussians: the axis of the smallest scale, turned outward.
 
-    Without ``outward``, normals point toward the camera. That flips the Gaussians just beyond a silhouette: they cancel
-    those just before it, and the blended normal leans to the camera. With ``outward``, they keep their side.
+    Without ``outward``, normals point toward the camera. That flips Gaussians just beyond a silhouette: they cancel
+    those just in front of it, and the blended normal leans to the camera. With ``outward``, they keep their side.
 
     Args:
-        means: [N, 3]. quaternions: [N, 4] (w, x, y, z), any length. log_scales: [N, 3]. center: [3] camera center.
-        outward: [N, 3] direction from which each is seen, which decides at grazing angles; zero where unknown.
+        means: [N, 3] centers.
+        quaternions: [N, 4] (w, x, y, z), any length.
+        log_scales: [N, 3] logarithms of the scales.
+        center: [3] camera center.
+        outward: [N, 3] direction from which each Gaussian is visible, which decides at grazing angles; zero: unknown.
 
     Returns:
         [N, 3] world axes, differentiable in the quaternions (Ye et al. 2024, Sec. 3.2).
@@ -115,10 +118,12 @@ def shortest_axis_normals(
 
 
 def mirrored_directions(means: Tensor, center: Tensor, normals: Tensor) -> Tensor:
-    """Directions of the rays from the camera after reflection at each Gaussian; without gradients.
+    """Return directions of the rays from the camera after reflection at each Gaussian, without gradients.
 
     Args:
-        means: [N, 3]. center: [3] camera center. normals: [N, 3] unit.
+        means: [N, 3] centers.
+        center: [3] camera center.
+        normals: [N, 3] unit.
 
     Returns:
         [N, 3], unit; zero for a mean at the center.

@@ -1,8 +1,8 @@
 """Real spherical harmonics to degree 3, in the order and with the signs of the 3DGS release.
 
 Degree 1 is in the order -y, z, -x. On the CPU in float32 a native kernel evaluates the colors;
-``evaluate_sh_reference`` is its reference implementation in plain torch. The constants stand a second time in
-``native/harmonics_kernels.cpp`` and a third time in ``export/page/derive.frag``.
+``evaluate_sh_reference`` is its reference implementation in plain torch. ``native/harmonics_kernels.cpp`` and
+``export/page/derive.frag`` repeat the constants.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _C3 = (
 
 
 def sh_basis(directions: Tensor, degree: int) -> Tensor:
-    """The basis functions at unit directions.
+    """Evaluate the basis functions at unit directions.
 
     Args:
         directions: [..., 3], unit length.
@@ -42,7 +42,7 @@ def sh_basis(directions: Tensor, degree: int) -> Tensor:
         [..., (degree + 1)^2], differentiable.
 
     Raises:
-        ValueError: for another degree.
+        ValueError: another degree.
     """
     if not 0 <= degree <= 3:
         raise ValueError(f"degree: expected 0 to 3, found {degree}")
@@ -75,14 +75,14 @@ def sh_basis(directions: Tensor, degree: int) -> Tensor:
 
 
 def _directions(means: Tensor, center: Tensor) -> Tensor:
-    """Unit vectors from the center to the means; zero, with gradient zero, for a mean at the center."""
+    """Return unit vectors from the center to the means; zero, with gradient zero, for a mean at the center."""
     offsets = means - center
     squared = offsets.square().sum(dim=-1, keepdim=True)
     return offsets * squared.masked_fill(squared <= 1e-24, torch.inf).rsqrt()
 
 
 def evaluate_sh_reference(means: Tensor, center: Tensor, dc: Tensor, rest: Tensor, degree: int) -> Tensor:
-    """The reference implementation of ``evaluate_sh``: plain torch, any dtype and device."""
+    """Compute ``evaluate_sh`` in plain torch: the reference implementation, for any dtype and device."""
     basis = sh_basis(_directions(means, center), degree)
     coefficients = torch.cat((dc[:, None], rest), dim=1)[:, : basis.shape[-1]]
     return (basis[..., None] * coefficients).sum(dim=1)
@@ -112,13 +112,13 @@ class _Harmonics(torch.autograd.Function):
 
 
 def evaluate_sh(means: Tensor, center: Tensor, dc: Tensor, rest: Tensor, degree: int) -> Tensor:
-    """Each Gaussian's color from a camera: ``sum_k basis_k(d) coefficient_k``, ``d`` from center to mean.
+    """Evaluate each Gaussian's color from a camera: ``sum_k basis_k(d) coefficient_k``, ``d`` from center to mean.
 
-    ``d`` has unit length, or is 0 for a Gaussian at the center. The 0.5 that 3DGS adds is not in it.
+    ``d`` has unit length, or is 0 for a Gaussian at the center. The offset 0.5 of 3DGS is not included.
 
     Args:
         means: [N, 3] Gaussian centers.
-        center: [3] camera center; of any dtype and device, and gets no gradient.
+        center: [3] camera center, of any dtype and device; gets no gradient.
         dc: [N, 3] coefficients of degree 0.
         rest: [N, 15, 3] coefficients of degrees 1 to 3.
         degree: 0 to 3; coefficients beyond it count as zero and get a zero gradient.
@@ -127,7 +127,7 @@ def evaluate_sh(means: Tensor, center: Tensor, dc: Tensor, rest: Tensor, degree:
         [N, 3], differentiable in means (through the direction), dc and rest.
 
     Raises:
-        ValueError: if a shape or the degree is not as above.
+        ValueError: a shape or the degree differs.
     """
     count = means.shape[0]
     expected = {"means": (means, (count, 3)), "center": (center, (3,)), "dc": (dc, (count, 3))}

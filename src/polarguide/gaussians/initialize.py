@@ -1,4 +1,4 @@
-"""Initial Gaussians: at the SfM points, and on shells far around the capture, where SfM has none."""
+"""Initial Gaussians: at the SfM points, and on shells far around the capture, beyond the points."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from polarguide.gaussians.harmonics import SH_C0
 
 @dataclass(frozen=True)
 class Initialization:
-    """How training is initialized beyond the SfM points.
+    """Initialization of a training beyond the SfM points.
 
     Attributes:
         shell: Gaussians far around the capture, for surroundings that SfM does not triangulate. None are added inside:
-            random Gaussians among the cameras end as haze in front of them.
+            random Gaussians among the cameras become haze in front of them.
         shell_radii: distances of the nearest and the farthest from the median of the points, in units of the cameras'
-            distance. At this distance they have little parallax, as sky and horizon.
+            distance. At this distance they have little parallax, like sky and horizon.
         opacity: initial opacity of all Gaussians.
     """
 
@@ -45,7 +45,7 @@ def neighbor_distance(points: np.ndarray) -> np.ndarray:
 
 
 def camera_reach(points: np.ndarray, cameras: np.ndarray) -> tuple[np.ndarray, float]:
-    """The median of the points [M, 3], and the distance from it within which nine tenths of the cameras [V, 3] are."""
+    """Return the median of the points [M, 3], and the 90 % quantile of the cameras' [V, 3] distances from it."""
     middle = np.median(points, axis=0)
     return middle, float(np.quantile(np.linalg.norm(cameras - middle, axis=1), 0.9))
 
@@ -56,17 +56,23 @@ def stretch_steps(means: Tensor, before: Tensor, middle: Tensor, reach: float) -
     The step of a Gaussian then has the same size in a picture at any distance.
 
     Args:
-        means: [N, 3] positions after the step. before: [N, 3] positions before it.
-        middle: [3] median of the points. reach: distance of the cameras from it.
+        means: [N, 3] positions after the step.
+        before: [N, 3] positions before it.
+        middle: [3] median of the points.
+        reach: distance of the cameras from it.
     """
     factor = ((before - middle).norm(dim=1, keepdim=True) / reach).clamp(min=1)
     means.copy_(torch.where(factor > 1, torch.lerp(before, means, factor), means))
 
 
 def far_away(means: Tensor, points: Tensor, centers: Tensor, share: float = 1.0) -> Tensor:
-    """Which of the positions [N, 3] lie farther from the middle of the points [M, 3] than the cameras [V, 3]; [N].
+    """Return a mask [N] of positions [N, 3] beyond a share of the cameras' distance from the middle of the points.
 
-    Or than this share of the cameras' distance.
+    Args:
+        means: [N, 3] positions.
+        points: [M, 3] SfM points.
+        centers: [V, 3] camera centers.
+        share: share of ``camera_reach``.
     """
     middle, radius = camera_reach(points.double().numpy(), centers.double().numpy())
     return (means.double() - torch.from_numpy(middle)).norm(dim=1) > share * radius
@@ -75,13 +81,13 @@ def far_away(means: Tensor, points: Tensor, centers: Tensor, share: float = 1.0)
 def initial_parameters(
     points: Tensor, colors: Tensor, centers: Tensor, settings: Initialization, *, seed: int
 ) -> dict[str, Tensor]:
-    """The parameters to begin with.
+    """Return the initial parameters.
 
     Args:
         points: [M, 3] SfM points.
         colors: [M, 3] linear colors in [0, 1].
         centers: [V, 3] camera centers.
-        settings: how many Gaussians are added, where, and the opacity.
+        settings: number and place of added Gaussians, and the opacity.
         seed: seed of the random positions and orientations.
 
     Returns:
@@ -94,13 +100,13 @@ def initial_parameters(
     directions = random.normal(size=(settings.shell, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     near, far = (radius * r for r in settings.shell_radii)
-    # Evenly spaced in 1/distance, as parallax is.
+    # Evenly spaced in 1/distance, like parallax.
     away = 1 / (1 / near + (1 / far - 1 / near) * random.random(settings.shell))
     added = middle + directions * away[:, None]
     means = np.concatenate((sfm, added))
     gray = colors.double().mean(dim=0, keepdim=True).numpy() if len(sfm) else np.full((1, 3), 0.5)
     rgb = np.concatenate((colors.double().numpy(), np.repeat(gray, len(added), axis=0)))
-    # Each kind measures its spacing among its own: a shell Gaussian must not shrink because SfM points are dense.
+    # The spacing is measured within each kind, so that dense SfM points do not shrink Gaussians of the shell.
     parts = (sfm, added)
     spacing = np.concatenate([neighbor_distance(part) for part in parts if len(part)])
     count = len(means)

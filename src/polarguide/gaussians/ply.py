@@ -1,9 +1,9 @@
-"""PLY files of Gaussians as the 3DGS release writes them, so that ordinary viewers open them.
+"""PLY files of Gaussians in the format of the 3DGS release, which ordinary viewers open.
 
-One ``vertex`` per Gaussian, float32 binary little-endian: position, normal (where the release has zero),
-spherical harmonics of the display color, opacity (logit), scales (log), rotation (w, x, y, z). These are
-62 floats. Readers such as the SIBR viewer of the release take records of this size whatever the header says.
-Further fields make a file for readers that take fields by name.
+One ``vertex`` per Gaussian, float32 binary little-endian: position, normal (zero in the release), spherical harmonics
+of the display color, opacity (logit), scales (log), rotation (w, x, y, z). These are 62 floats. Readers such as the
+SIBR viewer of the release assume records of this size for every header. Files with further fields are for readers that
+find fields by name.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from polarguide.geometry.vectors import spread_directions
 REST_COUNT = 15
 DIRECTIONS = 64
 TOGETHER = 8192
-"""Gaussians fitted at a time: about 100 MB."""
+"""Batch size of the fit in Gaussians: about 100 MB."""
 
 RELEASE_FIELDS = (
     *("x", "y", "z", "nx", "ny", "nz"),
@@ -39,7 +39,7 @@ RELEASE_FIELDS = (
     *(f"scale_{i}" for i in range(3)),
     *(f"rot_{i}" for i in range(4)),
 )
-"""The fields of the 3DGS release at degree 3, in order. ``f_rest`` is channel-major: all of red first."""
+"""Fields of the 3DGS release at degree 3, in order. ``f_rest`` is channel-major: all of red first."""
 
 
 def write_ply(
@@ -54,7 +54,7 @@ def write_ply(
     normals: Tensor | None = None,
     extra: Mapping[str, Tensor] | None = None,
 ) -> None:
-    """Write Gaussians in one step: a reader sees the old file or the whole new one.
+    """Write Gaussians atomically.
 
     Args:
         path: the file; its folder must exist.
@@ -64,12 +64,12 @@ def write_ply(
         opacity_logits: [N] or [N, 1].
         sh_dc, sh_rest: [N, 1, 3] and [N, 15, 3] harmonics of the display (sRGB-encoded) color minus 0.5.
         normals: [N, 3] world axes; zero, as in the release, if None.
-        extra: further floating-point tensors [N, ...] by name (letters, digits, underscores). A tensor [N]
-            becomes the field ``name``; one [N, ..., C] the fields ``name_0`` and so on, last axis slowest
-            (channel-major, as ``f_rest``). A header comment keeps its shape.
+        extra: further floating-point tensors [N, ...] by name (letters, digits, underscores). A tensor [N] becomes the
+            field ``name``; one [N, ..., C] the fields ``name_0`` and so on, last axis slowest (channel-major, as
+            ``f_rest``). A header comment records its shape.
 
     Raises:
-        ValueError: shapes, names or types that do not fit.
+        ValueError: a shape, name or type is wrong.
     """
     count = means.shape[0]
     core = {
@@ -98,7 +98,7 @@ def write_ply(
         comments.append(f"extra {' '.join([name, *map(str, tensor.shape[1:])])}")
     table = np.concatenate([_columns(column) for column in columns], axis=1)
     vertices = np.ascontiguousarray(table).view([(name, "<f4") for name in names])[:, 0]
-    # The comments belong to the element: a reader that expects its line third, as SIBR does, finds it there.
+    # Comments of the element, so that its own line is the third, where SIBR expects it.
     element = PlyElement.describe(vertices, "vertex", comments=comments)
     with atomic(Path(path)) as temporary:
         PlyData([element], byte_order="<").write(temporary)
@@ -108,10 +108,9 @@ def read_ply(path: str | Path) -> dict[str, Any]:
     """Read Gaussians written by ``write_ply`` or another 3DGS program (any degree of harmonics up to 3).
 
     Returns:
-        ``means``, ``log_scales``, ``quaternions``, ``opacity_logits`` [N], ``sh_dc`` [N, 1, 3] and
-        ``sh_rest`` [N, K, 3] (K = 15 for degree 3) as float32 tensors, and ``extra``: the other tensors by
-        name, in the shapes they were written in. A field that no comment describes is a tensor [N] of its
-        own.
+        ``means``, ``log_scales``, ``quaternions``, ``opacity_logits`` [N], ``sh_dc`` [N, 1, 3] and ``sh_rest`` [N, K,
+        3] (K = 15 for degree 3) as float32 tensors. ``extra`` has the other tensors by name, in their shapes. A field
+        without a comment is a tensor [N].
 
     Raises:
         PolarguideError: not a PLY file, or one without the fields of the 3DGS release.
@@ -124,7 +123,7 @@ def read_ply(path: str | Path) -> dict[str, Any]:
         found = f"no {missing[0]}" if missing else f"{rest} fields f_rest_*"
         raise _unreadable(path, "the vertex fields of a 3DGS file (degree 0 to 3)", found)
 
-    # One pass over the records: reading field by field would walk the whole file for each.
+    # One pass over the records; reading by field would traverse the file for each field.
     table = torch.from_numpy(structured_to_unstructured(np.asarray(element.data), dtype=np.float32))
     column = {name: index for index, name in enumerate(names)}
 
@@ -160,16 +159,17 @@ def refit_sh(
     normals: Tensor,
     slope: Callable[[Tensor], Tensor] | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Harmonics of degree 3 of the colors of Gaussians, ``color = 0.5 + sum``, by weighted least squares for each.
+    """Fit harmonics of degree 3 to the colors of Gaussians, ``color = 0.5 + sum``, by weighted least squares for each.
 
-    The colors are sampled in directions spread evenly over the sphere. A direction counts as much as a flat Gaussian
-    shows of itself there: by the cosine to its normal, on either side.
+    The colors are sampled in evenly spread directions. The weight of a direction is the visible area of a flat
+    Gaussian: the absolute cosine to its normal.
 
     Args:
-        color_fn: maps some of the Gaussians and directions [K, 3] (unit, from the camera to the Gaussian, as harmonics
-            take them) to colors [P, K, 3].
+        color_fn: maps some of the Gaussians and directions [K, 3] (unit, from the camera to the Gaussian, as in
+            harmonics) to colors [P, K, 3].
         normals: [N, 3] unit.
-        slope: of the display curve at colors, where they are not encoded by it: their errors count as they are seen.
+        slope: slope of the display curve at linear colors, which weights their errors as displayed; None: displayed
+            colors.
 
     Returns:
         dc [N, 1, 3] and rest [N, 15, 3] float32.
@@ -209,7 +209,7 @@ def _extra_fields(name: str, shape: tuple[int, ...]) -> list[str]:
 
 
 def _columns(tensor: Tensor) -> NDArray[np.float32]:
-    """[N, ...] as a table [N, fields], last axis slowest."""
+    """Convert [N, ...] to a table [N, fields], last axis slowest."""
     table = tensor.detach().to("cpu", torch.float32)
     if table.ndim > 2:
         table = table.movedim(-1, 1)
@@ -217,7 +217,7 @@ def _columns(tensor: Tensor) -> NDArray[np.float32]:
 
 
 def _from_columns(table: Tensor, shape: tuple[int, ...]) -> Tensor:
-    """The inverse of ``_columns`` for rows of ``shape``."""
+    """Convert a table of ``_columns`` to rows of ``shape``."""
     if len(shape) < 2:
         return table.reshape(-1, *shape)
     return table.reshape(-1, shape[-1], *shape[:-1]).movedim(1, -1).contiguous()
@@ -239,4 +239,4 @@ def _read_vertex(path: str | Path) -> PlyElement:
 
 
 def _unreadable(path: str | Path, expected: str, found: str) -> PolarguideError:
-    return PolarguideError(path, expected=expected, found=found, remedy="Give a PLY file of Gaussians.")
+    return PolarguideError(path, expected=expected, found=found, remedy="Specify a PLY file of Gaussians.")

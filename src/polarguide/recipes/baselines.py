@@ -6,9 +6,6 @@ from polarguide.shading.deferred import DeferredShading
 from polarguide.shading.directional import DirectionalShading
 from polarguide.training.recipe import Recipe, Repeat, Rounds, Stage, Weights
 
-# Learning rates of the 3DGS release but for the geometry's, which belong to 30,000 steps: in some thousand, means and
-# scales have to learn twice as fast and rotations ten times. That of the means is times the scene's extent, and falls
-# to a tenth in place of a hundredth (``Recipe.means_decay``).
 RATES = {
     "means": 3.2e-4,
     "sh_dc": 2.5e-3,
@@ -17,9 +14,15 @@ RATES = {
     "log_scales": 1e-2,
     "quaternions": 1e-2,
 }
+"""Learning rates of every recipe: those of the 3DGS release, except for the geometry.
 
-# 3,000 of 30,000 steps in the release; in short trainings a reset needs time to heal.
+The release has 30,000 steps. In some thousand steps, means and scales have to learn twice as fast and rotations ten
+times. The rate of the means is relative to the scene's extent, and falls to a tenth in place of a hundredth
+(``Recipe.means_decay``).
+"""
+
 RESET = Repeat("reset_opacity", fraction=0.1, minimum=700)
+"""Opacity reset: 3,000 of 30,000 steps in the release; short trainings need time to recover."""
 
 RECIPE_3DGS = Recipe(
     name="3dgs",
@@ -31,12 +34,15 @@ RECIPE_3DGS = Recipe(
     rates=RATES,
 )
 
-# Of 61,000 steps, the release resets every 3,000 and propagates at the other thousands. Here one propagation lies in
-# the middle between two resets: what it makes opaque and wide has to go again before the next.
 PROPAGATION_DR = Rounds(("propagate_normals", "reset_opacity"), 1.5 / 61, minimum=350)
+"""Propagations and resets in turn.
+
+The release resets every 3,000 of 61,000 steps and propagates at the other thousands. Here one propagation lies in the
+middle between two resets, which remove again the opacity and width that it adds.
+"""
 RESET_DR = Repeat("reset_opacity", fraction=3 / 61, minimum=700)
 
-# The release's first values (0.001, 5, 0.05, 128) need its 61,000 steps: see docs/explanation/baselines.md.
+# The initial values of the release (0.001, 5, 0.05, 128) need its 61,000 steps: see docs/explanation/baselines.md.
 SHADING_3DGS_DR = DeferredShading(
     first_strength=0.05,
     environment_spread=0.2,
@@ -50,7 +56,7 @@ RECIPE_3DGS_DR = Recipe(
     stages=(
         Stage("plain", 6 / 61, reflection=False, densify=True),
         Stage("propagate", 18 / 61, reflection=True, densify=True, rounds=PROPAGATION_DR),
-        # The last turn of the last round: what no view needs must not stay as opaque as the propagation left it.
+        # The last turn of the last round: unneeded Gaussians lose the opacity of the propagation.
         Stage(
             "densify",
             6 / 61,
@@ -73,7 +79,7 @@ RECIPE_REF_GS = Recipe(
     name="ref-gs",
     about="Deferred shading with a learned directional grid and an MLP: RGB alone.",
     stages=(
-        # No resets of the opacity: thousands of steps, not tens of thousands, do not make up for them here.
+        # No resets of the opacity, from which some thousand steps do not recover.
         Stage("densify", 0.5, reflection=True, weights=WEIGHTS, densify=True),
         Stage("refine", 0.5, reflection=True, weights=WEIGHTS),
     ),

@@ -1,7 +1,7 @@
-"""Our recipes: PolarGuide-GSDR's three stages (Shan et al. 2026), by the letter and with the physics repaired.
+"""Recipes of polarguide: PolarGuide-GSDR's three stages (Shan et al. 2026), literally and with repaired physics.
 
-What they share with ``3dgs-dr`` (rates, first strength, environment, SH schedule) is taken from it, so that a
-difference between the two is a difference of supervision.
+Rates, first strength, environment and SH schedule are those of ``3dgs-dr``, so that a difference between the two is a
+difference of supervision.
 """
 
 from __future__ import annotations
@@ -14,8 +14,11 @@ from polarguide.training.recipe import Action, Priors, Recipe, Repeat, Stage, We
 
 REFRESH = Repeat("refresh_priors", fraction=0.1, minimum=250)
 
-# The subject ends before: on ten rendered scenes, 95 to 100 % of its pixels are nearer than the first.
 BEHIND = (1.15, 1.5)
+"""Begin and end of the fading behind the subject, see ``Stage.behind``.
+
+On ten rendered scenes, 95 to 100 % of the subject's pixels are nearer than the begin.
+"""
 _PLAIN = Stage("plain", 0.1, reflection=False, densify=True)
 
 
@@ -28,7 +31,7 @@ def _stages(
     hold_normals: bool = True,
     behind: tuple[float, float] | None = BEHIND,
 ) -> tuple[Stage, ...]:
-    """The three stages of PolarGuide-GSDR; the guided one first with, then without density control."""
+    """Return the three stages of PolarGuide-GSDR; the guided one first with, then without density control."""
     enter: tuple[Action, ...] = ("refresh_priors",)
     orient: tuple[Action, ...] = ("orient_normals",) if oriented else ()
     return (
@@ -41,7 +44,7 @@ def _stages(
             densify=True,
             repeats=(REFRESH,),
             on_enter=enter,
-            # While the geometry forms; later what the layers mirror tells more of the normals than it misleads.
+            # Mirrored light misleads normals while the geometry forms, and informs them later.
             hold_normals=hold_normals,
             behind=behind,
         ),
@@ -60,8 +63,8 @@ def _stages(
 
 _MEASURED = Weights(azimuth=0.15, chromatic=0.05)
 _GUIDED = replace(_MEASURED, flatness=0.3, consistency=0.1)
-# Last comes the picture: what is measured of the normals holds, what keeps the geometry in order lets go, and rotations
-# come to rest.
+# The final stage favors the picture: terms on measured normals stay, regularization of the geometry decreases, and
+# rotations slow down.
 _FINAL = replace(_MEASURED, flatness=0.06, consistency=0.02)
 _SLOW = {"quaternions": 0.2}
 
@@ -122,7 +125,7 @@ _PAPER = Priors(
     threshold=0.1,
     full_dolp=1e-6,  # a pixel counts fully or not at all
     azimuth_weight=0.0,
-    azimuth_share=1.0,  # the sum over the pixels that count is divided by all pixels
+    azimuth_share=1.0,  # the mean is over all pixels
 )
 _PAPER_NORMAL = 0.02
 _PAPER_SPECULAR = 0.1
@@ -130,12 +133,12 @@ _PAPER_DIFFUSE = 0.05
 
 
 def _paper_stages(guided: Weights, final: float, *, deferred_first: bool) -> tuple[Stage, ...]:
-    """3DGS-DR's stages with the terms of PolarGuide-GSDR in its second and third stage.
+    """Return the stages of 3DGS-DR with the terms of PolarGuide-GSDR in its second and third stage.
 
     Args:
         guided: weights between the first stage and the final one.
-        final: share of the steps that the final stage takes.
-        deferred_first: whether the first stage is shaded with deferred reflection, too.
+        final: share of the steps of the final stage.
+        deferred_first: shade the first stage with deferred reflection as well.
     """
     plain, propagate, densify, refine = RECIPE_3DGS_DR.stages
     return (

@@ -3,8 +3,8 @@
 A control is a recipe without any polarization. Other ablations belong to ``polarguide_bench``.
 
 A plug-in is a package with entry points of the group ``polarguide.recipes``. Each names a ``Recipe``, a sequence of
-them, or a function without arguments that returns either. Plug-ins are loaded for a name that is not
-built in, never on import; a run's folder records the recipe's name, and never where its code lies.
+recipes, or a function without arguments that returns either. Plug-ins are loaded for a name that is not built in, never
+on import. A run's folder records the recipe's name, not the place of its code.
 """
 
 from __future__ import annotations
@@ -26,34 +26,38 @@ from polarguide.recipes.polarguide import (
 from polarguide.training.recipe import Action, Recipe, Stage, Weights, check_recipe
 
 Change = Callable[[Recipe], Recipe]
+"""Function that derives a recipe from another one."""
 
 
 def varied(base: Recipe, *table: tuple[str, str, Change]) -> tuple[Recipe, ...]:
-    """The recipes ``base:name`` of a table: a name, what it is about, and how it differs from ``base``."""
+    """Return the recipes ``base:name`` of a table with name, description, and change of ``base``."""
     return tuple(
         replace(change(base), name=f"{base.name}:{name}", about=about) for name, about, change in table
     )
 
 
 def staged(change: Callable[[Stage], Stage]) -> Change:
-    """Every stage changed."""
+    """Return a change of every stage."""
     return lambda recipe: replace(recipe, stages=tuple(change(stage) for stage in recipe.stages))
 
 
 def weighing(change: Callable[[Weights], Weights]) -> Change:
-    """The new weights from the old ones, in every stage that has polarization terms."""
+    """Return a change of the weights in every stage with polarization terms."""
     return staged(
         lambda stage: replace(stage, weights=change(stage.weights)) if stage.weights.priors else stage
     )
 
 
 def off(*names: str) -> Change:
-    """Without the loss terms of these names."""
+    """Return a change that removes the loss terms of these names."""
     return weighing(lambda old: replace(old, **dict.fromkeys(names, 0.0)))
 
 
 def without(action: Action) -> Change:
-    """An action does not happen. (Priors are then computed once, when they are first needed.)"""
+    """Return a change that removes an action.
+
+    Without refreshes, priors are computed once, when they are first needed.
+    """
 
     def change(stage: Stage) -> Stage:
         repeats = tuple(repeat for repeat in stage.repeats if repeat.action != action)
@@ -63,7 +67,7 @@ def without(action: Action) -> Change:
 
 
 def both(first: Change, second: Change) -> Change:
-    """One change after the other."""
+    """Return a change that applies two changes in order."""
     return lambda recipe: second(first(recipe))
 
 
@@ -77,8 +81,9 @@ UNPOLARIZED = (
 
 
 GROUP = "polarguide.recipes"
+"""Group of the entry points of plug-ins."""
 NEIGHBOR = "polarguide_bench.recipes"
-"""The module of the ablations."""
+"""Module of the ablations."""
 _ONLY_COMPARED = "gnerp"
 """A recipe of a signed-distance field, and its ablations: ``polarguide_bench`` trains and scores them."""
 
@@ -115,10 +120,10 @@ _BUILT_IN = {
 
 
 def recipe_named(name: str) -> Recipe:
-    """A recipe or a variation by name; ablations and plug-ins are loaded if it is not built in.
+    """Return a recipe or a variation by name; ablations and plug-ins are loaded if it is not built in.
 
     Raises:
-        PolarguideError: there is none of that name, two plug-ins have it, or its plug-in cannot be loaded.
+        PolarguideError: the name is unknown or belongs to two plug-ins, or its plug-in cannot be loaded.
     """
     if name in _BUILT_IN:
         return _BUILT_IN[name]
@@ -157,7 +162,7 @@ def recipe_named(name: str) -> Recipe:
 
 
 def recipe_names() -> list[str]:
-    """Names of all recipes that ``train`` takes: built-in ones, controls, ablations, and those of plug-ins.
+    """Return the names of all recipes that ``train`` takes: built-in ones, controls, ablations, and those of plug-ins.
 
     Example:
         >>> polarguide.recipe_names()[:2]    # doctest: +SKIP
@@ -167,12 +172,12 @@ def recipe_names() -> list[str]:
 
 
 def variations_offered(name: str) -> tuple[Recipe, ...]:
-    """The recipes that plug-ins offer as ``name:variation``."""
+    """Return the recipes that plug-ins offer as ``name:variation``."""
     return tuple(recipe_named(key) for key in _plugins()[0] if key.startswith(f"{name}:"))
 
 
 def _ablations() -> dict[str, Recipe]:
-    """The ablations by name; none where their package is not installed."""
+    """Return the ablations by name; empty if their package is not installed."""
     if importlib.util.find_spec(NEIGHBOR.partition(".")[0]) is None:
         return {}
     ablations: dict[str, Recipe] = importlib.import_module(NEIGHBOR).VARIATIONS
@@ -180,7 +185,7 @@ def _ablations() -> dict[str, Recipe]:
 
 
 def _plugins() -> tuple[dict[str, dict[str, Recipe]], dict[str, PolarguideError]]:
-    """Recipes of plug-ins by name, each by the entry points that offer it; and failures by the entry point's name."""
+    """Return recipes of plug-ins by name and by their entry points, and failures by the name of the entry point."""
     offers: dict[str, dict[str, Recipe]] = {}
     failures: dict[str, PolarguideError] = {}
     for entry in entry_points(group=GROUP):
@@ -194,7 +199,7 @@ def _plugins() -> tuple[dict[str, dict[str, Recipe]], dict[str, PolarguideError]
 
 @lru_cache
 def _recipes_of(entry: EntryPoint) -> tuple[Recipe, ...]:
-    """The recipes of an entry point.
+    """Return the recipes of an entry point.
 
     Raises:
         PolarguideError: the entry point cannot be loaded, is no recipe, or has the name of a built-in one.
@@ -205,14 +210,14 @@ def _recipes_of(entry: EntryPoint) -> tuple[Recipe, ...]:
         loaded = entry.load()
         loaded = loaded() if callable(loaded) else loaded
         recipes = (loaded,) if isinstance(loaded, Recipe) else tuple(loaded)
-    except (Exception, SystemExit) as error:  # another package may fail in any way
-        found = f"{type(error).__name__}: {error}"
-        raise PolarguideError(where, expected="recipes", found=found, remedy=remedy) from error
+    except (Exception, SystemExit) as error:  # another package may raise any error
+        actual = f"{type(error).__name__}: {error}"
+        raise PolarguideError(where, expected="recipes", found=actual, remedy=remedy) from error
     for recipe in recipes:
         if not isinstance(recipe, Recipe):
             raise PolarguideError(where, expected="recipes", found=repr(recipe), remedy=remedy)
         check_recipe(recipe, where)
         if recipe.name in _BUILT_IN:
-            found = f"{recipe.name}, which is built in"
-            raise PolarguideError(where, expected="a name that no other has", found=found, remedy=remedy)
+            actual = f"{recipe.name}, which is built in"
+            raise PolarguideError(where, expected="a unique name", found=actual, remedy=remedy)
     return recipes

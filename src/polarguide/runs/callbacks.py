@@ -1,7 +1,4 @@
-"""Callbacks of a run for any method: progress with a log, checkpoints, viewer, memory and stop.
-
-Time that a piece of work takes, and whether other work ran beside it.
-"""
+"""Callbacks of a run for any method: progress with a log, checkpoints, viewer, memory and stop."""
 
 from __future__ import annotations
 
@@ -9,6 +6,7 @@ import contextlib
 import math
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -23,15 +21,16 @@ from polarguide.training.callback import Callback, Loop
 from polarguide.training.losses import refuse_diverged
 from polarguide.training.settings import StepReport
 
-# Share of one core that others may use before a time is no longer worth quoting.
 FOREIGN_SHARE = 0.10
+"""Share of one core above which other processes invalidate a measured time."""
 
 
 class Stopwatch:
-    """Adds up wall time, and compares the machine's busy time with this process's own.
+    """Wall time of an operation, with a check for other busy processes.
 
     Args:
-        seconds: time already spent (before a resume). alone: whether that was spent alone.
+        seconds: earlier time, before a resume.
+        alone: no other process was busy then.
     """
 
     def __init__(self, seconds: float = 0.0, alone: bool = True) -> None:
@@ -44,13 +43,13 @@ class Stopwatch:
 
     @contextlib.contextmanager
     def paused(self) -> Iterator[None]:
-        """Time inside does not count."""
+        """Exclude the time inside the context."""
         begin = time.perf_counter()
         yield
         self._pause += time.perf_counter() - begin
 
     def read(self) -> tuple[float, bool]:
-        """Seconds so far, and whether nothing else of weight ran beside."""
+        """Return the seconds so far, and True if no other process was busy."""
         wall = time.perf_counter() - self._start
         foreign = (machine_busy_seconds() - self._machine) - (time.process_time() - self._own)
         alone = self._alone and foreign <= FOREIGN_SHARE * wall + 0.5
@@ -58,7 +57,7 @@ class Stopwatch:
 
 
 def in_words(seconds: float) -> str:
-    """A time as 40 s, 12 min or 1 h 05 min."""
+    """Format a time as 40 s, 12 min or 1 h 05 min."""
     if seconds < 90:
         return f"{seconds:.0f} s"
     minutes = round(seconds / 60)
@@ -108,7 +107,6 @@ class Progress(Callback[Loop]):
         self._waiting: list[StepReport] = []
 
     def after_step(self, loop: Loop, report: StepReport) -> None:
-        """Collect the report of a step."""
         if self._first < 0:
             self._first = report.done - 1
         elif report.step == 0 and self._log is not None:
@@ -157,6 +155,7 @@ class Progress(Callback[Loop]):
         return loss, psnr
 
 
+@dataclass(eq=False)
 class Checkpoints(Callback[Loop]):
     """Periodic checkpoints, written by rank 0.
 
@@ -167,23 +166,20 @@ class Checkpoints(Callback[Loop]):
         stopwatch: paused during a checkpoint.
     """
 
-    def __init__(self, out: Path, session: SessionOptions, progress: Progress, stopwatch: Stopwatch) -> None:
-        self._out = out
-        self._session = session
-        self._progress = progress
-        self._stopwatch = stopwatch
+    out: Path
+    session: SessionOptions
+    progress: Progress
+    stopwatch: Stopwatch
 
     def after_step(self, loop: Loop, report: StepReport) -> None:
-        """Save a checkpoint if one is due; ``at_end`` saves the last one."""
         step = loop.state.step
-        if step % self._session.checkpoint_every == 0 and step < loop.settings.steps:
-            with self._stopwatch.paused():
-                self._progress.read()
+        if step % self.session.checkpoint_every == 0 and step < loop.settings.steps:
+            with self.stopwatch.paused():
+                self.progress.read()
                 self.save(loop)
 
     def at_end(self, loop: Loop) -> None:
-        """Save the last checkpoint."""
-        self._progress.read()
+        self.progress.read()
         self.save(loop)
 
     def save(self, loop: Loop) -> None:
@@ -191,42 +187,39 @@ class Checkpoints(Callback[Loop]):
         state = loop.saved_state()
         if loop.ranks.rank == 0:
             unfinished = state.step < loop.settings.steps
-            save_checkpoint(self._out, state, optimizer=unfinished or self._session.keep_optimizer)
+            save_checkpoint(self.out, state, optimizer=unfinished or self.session.keep_optimizer)
 
 
+@dataclass(eq=False)
 class Viewing(Callback[Loop]):
     """Viewer between steps, while the stopwatch is paused."""
 
-    def __init__(self, look: Look, should_stop: Ends, stopwatch: Stopwatch) -> None:
-        self._look = look
-        self._should_stop = should_stop
-        self._stopwatch = stopwatch
+    look: Look
+    should_stop: Ends
+    stopwatch: Stopwatch
 
     def after_step(self, loop: Loop, report: StepReport) -> None:
-        """Let the viewer work."""
-        with self._stopwatch.paused():
-            self._look(self._should_stop)
+        with self.stopwatch.paused():
+            self.look(self.should_stop)
 
 
+@dataclass(eq=False)
 class MemoryLimit(Callback[Loop]):
     """Return of freed memory to the system between steps."""
 
-    def __init__(self, memory: MemoryBound) -> None:
-        self._memory = memory
+    memory: MemoryBound
 
     def after_step(self, loop: Loop, report: StepReport) -> None:
-        """Compare the memory of the process with its limit."""
-        self._memory.keep()
+        self.memory.keep()
 
 
+@dataclass(eq=False)
 class Stop(Callback[Loop]):
     """End of the training on request, after the same step on all ranks."""
 
-    def __init__(self, should_stop: Ends) -> None:
-        self._should_stop = should_stop
+    should_stop: Ends
 
     def after_step(self, loop: Loop, report: StepReport) -> None:
-        """Check for a request to end the training."""
         self.check(loop)
 
     def check(self, loop: Loop) -> None:
@@ -234,10 +227,11 @@ class Stop(Callback[Loop]):
         step = loop.state.step
         # Ranks rarely exchange the request, because each exchange takes time.
         due = step < loop.settings.steps and (loop.ranks.world == 1 or step % LOG_EVERY == 0)
-        if due and loop.ranks.any(self._should_stop()):
+        if due and loop.ranks.any(self.should_stop()):
             raise TrainingStopped(step)
 
 
+@dataclass(eq=False)
 class ResourceReport(Callback[Loop]):
     """Report of the time and the memory of a finished training.
 
@@ -247,17 +241,15 @@ class ResourceReport(Callback[Loop]):
         planned: planned bytes of memory.
     """
 
-    def __init__(self, reporter: Reporter, stopwatch: Stopwatch, planned: int) -> None:
-        self._reporter = reporter
-        self._stopwatch = stopwatch
-        self._planned = planned
+    reporter: Reporter
+    stopwatch: Stopwatch
+    planned: int
 
     def at_end(self, loop: Loop) -> None:
-        """Report both."""
         peak = peak_memory_mib()
         memory = "" if peak is None else f" and {in_gigabytes(int(peak * MEBIBYTE))} of memory"
-        seconds = in_words(self._stopwatch.read()[0])
-        self._reporter.say(f"took {seconds}{memory} (planned: up to {in_gigabytes(self._planned)})")
+        seconds = in_words(self.stopwatch.read()[0])
+        self.reporter.say(f"took {seconds}{memory} (planned: up to {in_gigabytes(self.planned)})")
 
 
 def run_to_the_end(

@@ -1,9 +1,9 @@
-"""A run folder: the configuration with nothing left open, atomically written checkpoints, the log, the exported PLY.
+"""A run folder: configuration, atomically written checkpoints, log, and exported PLY.
 
-RUN/run.json            the request (scene, recipe, settings), plain JSON
-RUN/checkpoint.safetensors   everything training needs to go on; at the end, all that rendering needs
-RUN/log.jsonl           one line per logged step
-RUN/point_cloud.ply     for other viewers, at the end
+- ``run.json``: scene, recipe and settings, plain JSON.
+- ``checkpoint.safetensors``: state to resume from; at the end, data for rendering.
+- ``log.jsonl``: one line per logged step.
+- ``point_cloud.ply``: Gaussians for other viewers, at the end.
 """
 
 from __future__ import annotations
@@ -52,14 +52,17 @@ class RunConfiguration:
     """The record that defines a run.
 
     Attributes:
-        scene: absolute path of the scene folder; ``IN_MEMORY`` of a scene of arrays.
-        scene_digest: hash of the scene's files, so that a run does not go on with other data.
-        recipe: its name. recipe_data: all its values, for the record.
-        settings: steps, seed, refractive index, with what was taken where nothing was specified.
-        downscale: side of the averaged pixel boxes. transfer: how the files were read.
-        device: what it trained on. version: version of the program.
+        scene: absolute path of the scene folder; ``IN_MEMORY`` for a scene of arrays.
+        scene_digest: hash of the scene's files, so that a run is not resumed with other data.
+        recipe: name of the recipe.
+        recipe_data: all values of the recipe, for the record.
+        settings: complete settings of the training.
+        downscale: side of the averaged pixel boxes.
+        transfer: transfer function of the files.
+        device: device of the training.
         test_views: the held-out views.
-        painted: digest of the materials that were painted over the run and are in it, see ``runs.painted``; None: none.
+        version: version of polarguide.
+        painted: digest of the painted materials of the training, see ``runs.painted``; None: no painted materials.
     """
 
     scene: Annotated[str, msgspec.Meta(min_length=1)]
@@ -84,7 +87,7 @@ class RunConfiguration:
         device: torch.device,
         painted: str | None = None,
     ) -> RunConfiguration:
-        """The record of a training."""
+        """Return the record of a training."""
         return cls(
             scene=str(scene.root if scene.root == IN_MEMORY else scene.root.resolve()),
             scene_digest=scene.digest,
@@ -115,7 +118,7 @@ class RunConfiguration:
                 run,
                 expected=f"a run folder with {CONFIGURATION}",
                 found="none",
-                remedy="Give the folder that a training wrote.",
+                remedy="Specify the folder of a training.",
             )
         remedy = "Restore the file, or train again into a new folder."
         data = read_file(path, largest=LARGEST_RECORD, remedy=remedy)
@@ -133,7 +136,7 @@ class RunConfiguration:
 
 
 def _refuse_unknown(data: dict[str, Any], record: RunConfiguration, path: Path, remedy: str) -> None:
-    """Refuse a record with more in it than is known: what was trained then may be something else."""
+    """Check that a record has no unknown fields, which could change the meaning of a run."""
     for place, values, of in (("", data, record), ("settings.", data["settings"], record.settings)):
         names = [field.name for field in dataclasses.fields(of)]
         for name in sorted(values.keys() - names):
@@ -143,43 +146,43 @@ def _refuse_unknown(data: dict[str, Any], record: RunConfiguration, path: Path, 
 
 @dataclass(frozen=True)
 class _Written:
-    """The fields of ``run.json`` that are read of every version."""
+    """The fields of ``run.json`` that are read for every version."""
 
     version: str
 
 
 def _series(version: str) -> str:
-    """The versions that read each other's runs: 0.2 of 0.2.1."""
+    """Return the series of versions that read each other's runs: 0.2 of 0.2.1."""
     return ".".join(version.split(".")[:2])
 
 
 def save_checkpoint(run: Path, state: SavedState, *, optimizer: bool = True) -> None:
-    """Write the state so that a kill at any moment leaves either the old checkpoint or the new one.
+    """Write the state atomically: after a kill, the old checkpoint or the new one is complete.
 
     Args:
-        run: its folder. state: what to write.
-        optimizer: with all that further steps need; without, Adam's moments and the frozen Gaussians are left out,
-            which nothing but a step reads.
+        run: the run folder.
+        state: state of the training.
+        optimizer: include Adam's moments, the frozen Gaussians and the tensors of callbacks, which only steps read.
 
     Raises:
-        PolarguideError: the checkpoint cannot be written; the old one stays.
+        PolarguideError: the checkpoint cannot be written; the old one remains.
     """
     tensors = state.tensors()
     if not optimizer:
         tensors = {name: values for name, values in tensors.items() if not FOR_STEPS & set(name.split("."))}
     with atomic(run / CHECKPOINT) as path:
         try:
-            # One entry: safetensors writes several in any order, and the same state should be the same bytes.
+            # One entry, because safetensors writes several in random order: equal states are equal bytes.
             save_file(tensors, path, metadata={"polarguide": f"{__version__}, step {state.step}"})
-        except SafetensorError as error:  # in place of an OSError, as on a full disk
+        except SafetensorError as error:  # raised for a full disk as well
             raise OSError(str(error)) from None
 
 
 def load_checkpoint(run: Path, recipe: Recipe, device: torch.device | str = "cpu") -> TrainingState:
-    """Read the state of a run, wherever it was trained, to a device.
+    """Read the state of a run to a device, for a training on any device.
 
     Raises:
-        PolarguideError: there is none, or it is damaged.
+        PolarguideError: the checkpoint is missing or damaged.
     """
     with checkpoint_tensors(run) as tensors:
         refuse_foreign(tensors, recipe)
@@ -188,20 +191,20 @@ def load_checkpoint(run: Path, recipe: Recipe, device: torch.device | str = "cpu
 
 @contextlib.contextmanager
 def checkpoint_tensors(run: Path) -> Iterator[dict[str, Tensor]]:
-    """The tensors in a run's checkpoint, on the CPU. Faults that are found inside are faults of the file.
+    """Yield the tensors of a run's checkpoint on the CPU; errors inside the context are reported as faults of the file.
 
     Raises:
-        PolarguideError: there is no checkpoint, or it is damaged.
+        PolarguideError: the checkpoint is missing or damaged.
     """
     path = run / CHECKPOINT
     if not path.exists():
         link = path.is_symlink()
-        again = "Bring back the file that it points to, or remove the link to begin at step 0."
+        restore = "Restore the target of the link, or remove the link to begin at step 0."
         raise PolarguideError(
             run,
             expected=f"a checkpoint ({CHECKPOINT})",
             found="a link to nowhere" if link else "none",
-            remedy=again if link else "Train first, or without --resume.",
+            remedy=restore if link else "Train first, or without --resume.",
         )
     require_file(path, expected="a checkpoint of this program", remedy="Train again into a new folder.")
     try:
@@ -219,7 +222,7 @@ def checkpoint_tensors(run: Path) -> Iterator[dict[str, Tensor]]:
 
 @contextlib.contextmanager
 def writing_to(run: Path) -> Iterator[None]:
-    """Keep others from writing to a run folder, which is made; the lock of a process that was killed is nobody's.
+    """Lock a run folder, which is created, against other writers; the lock ends with its process.
 
     Raises:
         PolarguideError: another training writes to it.
@@ -231,14 +234,16 @@ def writing_to(run: Path) -> Iterator[None]:
     except Timeout:
         raise PolarguideError(
             run,
-            expected="a run folder that nobody is writing to",
-            found="another training at work in it",
+            expected="a run folder without another training",
+            found="another training that writes to it",
             remedy="Wait until it has ended, or choose another folder.",
         ) from None
     except OSError as error:
-        found = error.strerror or str(error)
-        remedy = "Make room or give rights."
-        raise PolarguideError(run / LOCK, expected="to lock this file", found=found, remedy=remedy) from None
+        reason = error.strerror or str(error)
+        remedy = "Free space on the disk, or change the rights."
+        raise PolarguideError(
+            run / LOCK, expected="a file that can be locked", found=reason, remedy=remedy
+        ) from None
     try:
         yield
     finally:
@@ -246,7 +251,7 @@ def writing_to(run: Path) -> Iterator[None]:
 
 
 class RunLog:
-    """Appends one JSON line at a time."""
+    """Log with one JSON line per entry."""
 
     def __init__(self, run: Path) -> None:
         self._path = run / LOG
@@ -261,13 +266,13 @@ class RunLog:
             file.write(json.dumps(values) + "\n")
 
     def cut(self, step: int) -> None:
-        """Drop lines at or after a step, which a resumed training writes again, and what are no lines of ours."""
+        """Remove lines from a step on, which a resumed training writes again, and foreign lines."""
         if os.path.lexists(self._path):
             lines = [line for line, row in self._lines() if row["step"] < step]
             write_text(self._path, "".join(f"{line}\n" for line in lines))
 
     def rows(self) -> list[dict[str, Any]]:
-        """The complete lines of the log; none without a log. A line can be incomplete where a process was killed.
+        """Return the complete lines of the log; a killed process may leave an incomplete one. Empty without a log.
 
         Raises:
             PolarguideError: the log cannot be read.
@@ -275,25 +280,25 @@ class RunLog:
         return [row for _, row in self._lines()]
 
     def _lines(self) -> list[tuple[str, dict[str, Any]]]:
-        """Lines that are ours, as they stand there and as values."""
+        """Return the lines of polarguide as text and as values."""
         if not os.path.lexists(self._path):
             return []
         rows = []
-        remedy = "Remove it: a training needs none."
+        remedy = "Remove it; a training does not need it."
         for line in read_file(self._path, largest=LARGEST_RECORD, remedy=remedy).split(b"\n"):
-            with contextlib.suppress(ValueError, RecursionError):  # msgspec's are ValueErrors
+            with contextlib.suppress(ValueError, RecursionError):  # errors of msgspec are ValueErrors
                 row: dict[str, Any] = msgspec.to_builtins(_ROWS.decode(line))
                 rows.append((line.decode(), row))
         return rows
 
     def elapsed(self) -> tuple[float, bool]:
-        """Training seconds that the log accounts for, and whether the machine worked for nobody else."""
+        """Return the logged seconds of training, and True if no other process was busy."""
         rows = self.rows()
         return (rows[-1]["seconds"], rows[-1]["alone"]) if rows else (0.0, True)
 
 
 class _Row(msgspec.Struct):
-    """A line of the log, as far as something reads it."""
+    """Fields of a line of the log that are read."""
 
     step: Annotated[int, msgspec.Meta(ge=0)]
     seconds: Annotated[float, msgspec.Meta(ge=0)] = 0.0
@@ -305,24 +310,27 @@ _ROWS = msgspec.json.Decoder(_Row)
 
 
 OPEN = ("steps", "refractive_index", "views_per_step", "background")
-"""Settings that may be left open, beside the number of Gaussians, which bounds memory before the pictures are read."""
+"""Settings that may be unspecified, besides the number of Gaussians, which limits memory before pictures are read."""
 VISITS = 60
-"""Least number of times that each training view is looked at."""
+"""Least number of visits to each training view."""
 LARGE = 1_000_000
-"""Pixels of a view from which on twice the steps are taken: finer detail takes more rounds of the density control."""
+"""Pixels of a view above which the number of steps doubles: finer detail takes more rounds of the density control."""
 MOST_GAUSSIANS = 400_000
-"""Whatever the pixels, so that a large capture fits into a usual memory; trained scenes of 256 x 192 have 150,000. What
-more of them would give at full size was not studied.
+"""Upper limit of the default number of Gaussians, for the memory of large captures.
+
+Trained scenes of 256 x 192 have 150,000. More Gaussians at full size were not studied.
 """
 
 
 def most_gaussians(
     pixels: int, method: Recipe, settings: TrainSettings, resumed: ResolvedSettings | None = None
 ) -> int:
-    """How many Gaussians there may be for so many pixels of all views.
+    """Return the largest number of Gaussians for a number of pixels.
 
     Args:
-        pixels: pixels of the training views. asked, resumed: as for ``resolve``.
+        pixels: pixels of the training views.
+        method: the recipe.
+        settings, resumed: see ``resolve``.
     """
     if settings.gaussians is not None:
         return settings.gaussians
@@ -338,15 +346,16 @@ def resolve(
     *,
     processes: int = 1,
 ) -> ResolvedSettings:
-    """The settings of a training, with nothing left open.
+    """Return the complete settings of a training.
 
     Args:
-        settings: as specified. scene, method: those of the training.
-        resumed: settings of the run that is resumed, whose values come before those of the scene and its size.
-        processes: how many share the views of a step.
+        settings: specified settings.
+        scene, method: those of the training.
+        resumed: settings of the resumed run, which take precedence over those of the scene and its size.
+        processes: number of processes that share the views of a step.
 
     Raises:
-        PolarguideError: a setting that is out of range.
+        PolarguideError: a setting is out of range.
     """
     recorded = {} if resumed is None else {name: getattr(resumed, name) for name in OPEN}
     sizes = [view.camera.width * view.camera.height for view in scene.train_views]

@@ -1,7 +1,8 @@
-"""Health of a finished training, from training views alone: ``health.json`` of the run folder.
+"""Health and reports of a finished training, as callbacks at its end.
 
-A training can end normally with an unusable result. Each fact of this module describes one such fault. It has a limit
-with a meaning in ``Limits``, and leads to a warning that names views and a remedy.
+A training can end normally with an unusable result. Each fact in ``health.json`` describes one such fault. It has a
+limit with a meaning in ``Limits``, and leads to a warning that names views and a remedy. All facts come from training
+views alone. The reports cover polarizer angles and metals.
 """
 
 from __future__ import annotations
@@ -20,23 +21,29 @@ import torch
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
-from polarguide.capture import View
+from polarguide.capture import Scene, View
 from polarguide.capture.angle_evidence import TO_DEVIATION
-from polarguide.capture.exposures import analyzers
+from polarguide.capture.exposures import TABLE, Exposure, analyzers, table_text
+from polarguide.capture.layout import find_layout
 from polarguide.capture.variants import BLACK, black_pixels
 from polarguide.capture.view import listed
+from polarguide.core.errors import PolarguideError
 from polarguide.core.files import write_text
 from polarguide.core.progress import Reporter
 from polarguide.core.records import read_record
 from polarguide.core.text import command
 from polarguide.gaussians.densify import Densification, free_space
 from polarguide.optics.color import srgb_encode
-from polarguide.runs.model import GaussianModel
+from polarguide.runs.folder import PLY
+from polarguide.runs.model import GaussianModel, write_run_ply
 from polarguide.training.angles.fits import AngleFits
-from polarguide.training.angles.polarizers import Judgment, predicts_filters
+from polarguide.training.angles.polarizers import REMEDY, Judgment, Polarizers, predicts_filters
 from polarguide.training.callback import Callback
 from polarguide.training.loop import TrainingLoop
+from polarguide.training.metals.observations import blended, evenly
+from polarguide.training.metals.search import MetalSearch
 from polarguide.training.photometric import behind_analyzer
+from polarguide.visualization.figures import contact_sheet, radiance_to_rgb, scalar_to_rgb, write_png
 
 Word = Literal["measured", "fitted", "none"]
 Count = Annotated[int, msgspec.Meta(ge=0)]
@@ -92,16 +99,18 @@ class PolarizationSupport:
     @property
     def text(self) -> str:
         """Evidence of most training views, with the numbers of other views and of doubtful pictures."""
-        doubts = f" ({self.doubtful} of {self.pictures} pictures doubtful)" if self.pictures else ""
         counts = {"measured": self.measured, "fitted": self.fitted, "none": self.none}
-        more = {"measured": "", "fitted": doubts, "none": ""}
-        total = sum(counts.values())
-        others = [word for word in counts if counts[word] and word != self.word]
-        if not others:
-            guess = " (layers and normals are a guess of the model)" if self.word == "none" else ""
-            return f"{self.word}{more[self.word]}{guess}"
-        first = f"{self.word} in {counts[self.word]} of {total} views{more[self.word]}"
-        return ", ".join([first, *(f"{word} in {counts[word]}{more[word]}" for word in others)])
+        notes = dict.fromkeys(counts, "")
+        if self.pictures:
+            notes["fitted"] = f" ({self.doubtful} of {self.pictures} pictures doubtful)"
+        if self.none == sum(counts.values()):
+            return f"{self.word} (layers and normals are a guess of the model)"
+        words = sorted((word for word in counts if counts[word]), key=lambda word: word != self.word)
+        if len(words) == 1:
+            return f"{self.word}{notes[self.word]}"
+        texts = [f"{word} in {counts[word]}{notes[word]}" for word in words[1:]]
+        first = f"{self.word} in {counts[self.word]} of {sum(counts.values())} views{notes[self.word]}"
+        return ", ".join([first, *texts])
 
 
 HEALTH = "health.json"
@@ -374,8 +383,8 @@ def _neighbor_psnr(views: Sequence[View], psnr: Mapping[str, float | None]) -> d
     if len(scored) <= NEIGHBORS:
         return {}
     centers = torch.stack([view.camera.center for view in scored])
-    away = (centers - centers.mean(dim=0)).norm(dim=1).mean().clamp(min=1e-12)
-    places = torch.cat((centers / away, torch.stack([view.camera.rotation[2] for view in scored])), dim=1)
+    distance = (centers - centers.mean(dim=0)).norm(dim=1).mean().clamp(min=1e-12)
+    places = torch.cat((centers / distance, torch.stack([view.camera.rotation[2] for view in scored])), dim=1)
     distances = torch.cdist(places, places).fill_diagonal_(torch.inf)
     nearest = distances.topk(NEIGHBORS, largest=False).indices.tolist()
     values = [float(psnr[view.name] or 0.0) for view in scored]
@@ -407,16 +416,16 @@ def warnings_of(views: Mapping[str, ViewHealth], unseen: float | None, limits: L
         )
     exposed = {name: off for name, off in _exposed(views, limits).items() if name not in burned | bare}
     explained = burned | bare | exposed
-    far = [name for name in _far_under(views, limits) if name not in explained]
-    if far:
+    poor = [name for name in _far_under(views, limits) if name not in explained]
+    if poor:
         worst = ", ".join(
-            f"{name} ({views[name].psnr:.1f} dB, neighbors {views[name].beside:.1f} dB)" for name in far[:4]
+            f"{name} ({views[name].psnr:.1f} dB, neighbors {views[name].beside:.1f} dB)" for name in poor[:4]
         )
-        more = f" and {len(far) - 4} more" if len(far) > 4 else ""
+        rest = f" and {len(poor) - 4} more" if len(poor) > 4 else ""
         warnings.append(
-            f"training views with a far lower PSNR than their neighbors: {worst}{more}. Pose, polarizer angle, "
+            f"training views with a far lower PSNR than their neighbors: {worst}{rest}. Pose, polarizer angle, "
             "exposure or focus of these photographs may be wrong: "
-            f"{command('render', 'RUN', '--views', ','.join(far[:4]))} compares them "
+            f"{command('render', 'RUN', '--views', ','.join(poor[:4]))} compares them "
             "with the run; correct them or leave them out."
         )
     if exposed:
@@ -447,15 +456,17 @@ def warnings_of(views: Mapping[str, ViewHealth], unseen: float | None, limits: L
 
 def _exposed(views: Mapping[str, ViewHealth], limits: Limits) -> dict[str, float]:
     """Return the deviations of views with another exposure from the other views, in stops, the largest first."""
-    known = {name: torch.tensor(view.stops) for name, view in views.items() if view.stops is not None}
-    if len(known) <= NEIGHBORS:
+    stops_by_view = {name: torch.tensor(view.stops) for name, view in views.items() if view.stops is not None}
+    if len(stops_by_view) <= NEIGHBORS:
         return {}
-    stops = torch.stack(list(known.values()))
-    off = stops - stops.median(dim=0).values
-    least = max(limits.exposed, limits.scattered * TO_DEVIATION * float(off.abs().median()))
-    strongest = {name: max(row.tolist(), key=abs) for name, row in zip(known, off, strict=True)}
+    stops = torch.stack(list(stops_by_view.values()))
+    deviations = stops - stops.median(dim=0).values
+    threshold = max(limits.exposed, limits.scattered * TO_DEVIATION * float(deviations.abs().median()))
+    strongest = {
+        name: max(row.tolist(), key=abs) for name, row in zip(stops_by_view, deviations, strict=True)
+    }
     order = sorted(strongest, key=lambda name: -abs(strongest[name]))
-    return {name: strongest[name] for name in order if abs(strongest[name]) > least}
+    return {name: strongest[name] for name in order if abs(strongest[name]) > threshold}
 
 
 def _far_under(views: Mapping[str, ViewHealth], limits: Limits) -> list[str]:
@@ -466,8 +477,8 @@ def _far_under(views: Mapping[str, ViewHealth], limits: Limits) -> list[str]:
         if view.psnr is not None and view.beside is not None
     }
     scatter = TO_DEVIATION * median(map(abs, drops.values())) if drops else 0.0
-    least = max(limits.far, limits.scattered * scatter)
-    return sorted((name for name in drops if drops[name] > least), key=lambda name: -drops[name])
+    threshold = max(limits.far, limits.scattered * scatter)
+    return sorted((name for name in drops if drops[name] > threshold), key=lambda name: -drops[name])
 
 
 def _worst(shares: Mapping[str, float], of: str = "of the pixels") -> str:
@@ -476,6 +487,7 @@ def _worst(shares: Mapping[str, float], of: str = "of the pixels") -> str:
     return listed([f"{first} ({100 * shares[first]:.1f} % {of})", *rest])
 
 
+@dataclass(eq=False)
 class HealthCheck(Callback[TrainingLoop]):
     """Examination of a finished training: writes ``health.json`` and reports a summary.
 
@@ -485,16 +497,14 @@ class HealthCheck(Callback[TrainingLoop]):
         reports: reporter of the other reports of the training, whose warnings are recorded as well.
     """
 
-    def __init__(self, out: Path, fits: AngleFits, reports: RecordedWarnings) -> None:
-        self._out = out
-        self._fits = fits
-        self._reports = reports
+    out: Path
+    fits: AngleFits
+    reports: RecordedWarnings
 
     def at_end(self, loop: TrainingLoop) -> None:
-        """Examine the training views."""
         context = loop.context
         recipe = context.recipe
-        polarizers = self._fits.polarizers
+        polarizers = self.fits.polarizers
         views = [polarizers.believed(view) for view in context.views]
         filters = predicts_filters(recipe)
         priors = any(stage.weights.priors for stage in recipe.stages)
@@ -504,6 +514,195 @@ class HealthCheck(Callback[TrainingLoop]):
         health = examine(model, evidence, context.scene.points, context.settings.steps, context.reporter)
         for warning in health.warnings:
             context.reporter.warn(warning)
-        health = dataclasses.replace(health, warnings=(*health.warnings, *self._reports.warnings))
-        health.save(self._out)
+        health = dataclasses.replace(health, warnings=(*health.warnings, *self.reports.warnings))
+        health.save(self.out)
         context.reporter.say(f"{health.summary}; polarization: {health.polarization.text}")
+
+
+METALS_PICTURE = "metals.png"
+"""File with the picture of metals in a run folder."""
+METAL_VIEWS = 6
+"""Largest number of training views in that picture."""
+LARGEST_DIFFERENCE = 90.0
+"""Largest difference of two polarizer angles, in degrees."""
+
+
+def report_polarizers(out: Path, scene: Scene, polarizers: Polarizers, reporter: Reporter) -> None:
+    """Write ``angles.csv`` in the format of a scene, and report doubtful angles.
+
+    Args:
+        out: the run folder.
+        scene: the capture.
+        polarizers: angles of the finished training.
+        reporter: receives a summary, and a warning for pictures that contradict their specified angles.
+    """
+    judgments = polarizers.judgments()
+    if not judgments:
+        return
+    names = picture_files(scene)
+    by_picture = {(judgment.view, judgment.number): judgment for judgment in judgments}
+    lines: list[tuple[str, str, Exposure, float | None, str]] = []
+    for view in scene.views:
+        for number, exposure in enumerate(view.exposures):
+            judged = by_picture.get((view.name, number))
+            note = "doubtful" if judged and judged.doubtful and not judged.specified.known else ""
+            believed, modulation = (judged.believed, judged.modulation) if judged else (exposure, None)
+            lines.append((names[view.name][number], view.name, believed, modulation, note))
+    write_text(out / TABLE, table_text(lines))
+
+    def named(chosen: Sequence[Judgment]) -> str:
+        return f"{len(chosen)} of {len(judgments)} pictures ({listed([names[j.view][j.number] for j in chosen])})"
+
+    sought = [judgment for judgment in judgments if not judgment.specified.known]
+    if sought:
+        fitted = sum(judgment.believed.angle is not None for judgment in sought)
+        doubtful = sum(judgment.doubtful for judgment in sought)
+        reporter.say(
+            f"angles found for {fitted} of {len(sought)} pictures; {doubtful} of {len(sought)} are doubtful: "
+            f"{out / TABLE}"
+        )
+        if 2 * doubtful > len(sought):
+            reporter.warn(f"Most angles are doubtful, and so are the layers and normals. {REMEDY}")
+    vague = [judgment for judgment in sought if judgment.vague]
+    for chosen, fault in (
+        (
+            [judgment for judgment in vague if judgment.guesses],
+            "hardly determine their angle; the most likely one is used.",
+        ),
+        (
+            [judgment for judgment in vague if not judgment.guesses],
+            "do not determine their angle and are used as photographs.",
+        ),
+        (
+            [judgment for judgment in sought if judgment.unsettled],
+            "may be at another angle: the fits of the training do not agree on it.",
+        ),
+        (
+            [judgment for judgment in sought if judgment.poorly_explained and not judgment.unsettled],
+            "may be at another angle: the scene explains them worse than the others, and hardly better than a filter "
+            "turned by 90 degrees would.",
+        ),
+        (
+            [judgment for judgment in judgments if judgment.unfiltered],
+            "look as if taken without a filter, or through a circular one mounted the wrong way round.",
+        ),
+    ):
+        if chosen:
+            reporter.warn(f"{named(chosen)} {fault}")
+    specified = [judgment for judgment in judgments if judgment.specified.angle is not None]
+    if specified and all(judgment.estimate.limit >= LARGEST_DIFFERENCE for judgment in specified):
+        reporter.say(
+            f"known angles were not checked: the model predicts polarization too poorly (pictures look "
+            f"{specified[0].usual:.0f} degrees off in the median). "
+            f"{command('inspect', scene.root)} checks them separately."
+        )
+    if wrong := [judgment for judgment in judgments if judgment.contradicts]:
+        first = wrong[0]
+        reporter.warn(
+            f"{named(wrong)} contradict their angles: {names[first.view][first.number]} is specified at "
+            f"{first.specified.label} degrees and looks as if at {first.angle:.0f}. {command('inspect', scene.root)} "
+            "compares all angles separately; correct the names of the files or angles.csv where it agrees."
+        )
+
+
+def report_metals(
+    out: Path, scene: Scene, undecided: Tensor | None, model: GaussianModel, reporter: Reporter
+) -> None:
+    """Report metals and undecided surfaces, and write ``metals.png`` with both.
+
+    Args:
+        out: the run folder.
+        scene: the capture.
+        undecided: see ``MetalSearch.undecided``; None: no report.
+        model: the trained Gaussians.
+        reporter: receives a summary.
+    """
+    if undecided is None:
+        return
+    gaussians = model.state.gaussians
+    rasterize = model.backend.rasterize
+    views = evenly(scene.train_views, METAL_VIEWS)
+    kinds = [
+        [blended(gaussians, values, view.camera, rasterize).cpu() for view in views]
+        for values in (gaussians["metalness"], undecided.float())
+    ]
+    metal, unknown = (
+        100 * float(torch.stack([(k > 0.5).float().mean() for k in kind]).mean()) for kind in kinds
+    )
+    if not metal and not unknown:
+        (out / METALS_PICTURE).unlink(missing_ok=True)
+        return
+    rows = [
+        [radiance_to_rgb(view.photograph()), *(scalar_to_rgb(kind[row], 0.0, 1.0) for kind in kinds)]
+        for row, view in enumerate(views)
+    ]
+    labels = ["photograph", "metal", "undecided"]
+    write_png(out / METALS_PICTURE, contact_sheet(rows, [view.name for view in views], labels))
+    advice = ". Click on metal surfaces in the viewer (Materials), and resume" if unknown else ""
+    reporter.say(
+        f"metals: {metal:.1f} % of the pixels; not decided by polarization: {unknown:.1f} %, see "
+        f"{out / METALS_PICTURE}{advice}"
+    )
+
+
+def picture_files(scene: Scene) -> dict[str, list[str]]:
+    """Return the file names of each view's pictures; for a scene that is not read from such files, VIEW#NUMBER."""
+    try:
+        layout = find_layout(scene.root)
+    except PolarguideError:
+        layout = None
+    names = {}
+    for view in scene.views:
+        names[view.name] = [f"{view.name}#{number}" for number in range(len(view.exposures))]
+        if layout is not None and view.name in layout.names and layout.exposures(view.name) == view.exposures:
+            names[view.name] = [path.name for path in layout.files(view.name)]
+    return names
+
+
+@dataclass(eq=False)
+class PolarizerReport(Callback[TrainingLoop]):
+    """Report of the polarizer angles at the end of a training.
+
+    Args:
+        out: the run folder.
+        fits: fits of the angles.
+        reporter: receives the report.
+    """
+
+    out: Path
+    fits: AngleFits
+    reporter: Reporter
+
+    def at_end(self, loop: TrainingLoop) -> None:
+        report_polarizers(self.out, loop.context.scene, self.fits.polarizers, self.reporter)
+
+
+@dataclass(eq=False)
+class MetalReport(Callback[TrainingLoop]):
+    """Report of the metals at the end of a training.
+
+    Args:
+        out: the run folder.
+        reporter: receives the report.
+    """
+
+    out: Path
+    reporter: Reporter
+
+    def at_end(self, loop: TrainingLoop) -> None:
+        context = loop.context
+        model = GaussianModel.of(loop.state, context.recipe, context.settings, context.backend)
+        undecided = MetalSearch(loop.current).undecided(loop.state)
+        report_metals(self.out, context.scene, undecided, model, self.reporter)
+
+
+@dataclass(eq=False)
+class PlyFile(Callback[TrainingLoop]):
+    """PLY of the trained Gaussians in the run folder ``out``."""
+
+    out: Path
+
+    def at_end(self, loop: TrainingLoop) -> None:
+        context = loop.context
+        centers = torch.stack([view.camera.center for view in context.scene.views])
+        write_run_ply(self.out / PLY, loop.state, context.shading, centers)

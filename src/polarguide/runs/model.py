@@ -1,7 +1,7 @@
-"""The model of a run, which renders layers, and its PLY.
+"""Model of a run, which renders layers, and its PLY.
 
-The PLY holds display values that ordinary 3DGS viewers show right, in the fields of the 3DGS release alone: readers
-with a fixed layout would take further fields for the next Gaussian. Our linear fields are written where asked for.
+The PLY holds display values that ordinary 3DGS viewers show correctly, in the fields of the 3DGS release alone: readers
+with a fixed layout would read further fields as the next Gaussian. Linear fields of polarguide are written on request.
 """
 
 from __future__ import annotations
@@ -31,13 +31,11 @@ from polarguide.training.settings import ResolvedSettings
 from polarguide.training.state import TrainingState
 
 Within = Callable[[Tensor], Tensor]
-"""Tells which places [N, 3] of the scene are shown, [N] bool."""
+"""Function that returns the visible ones of places [N, 3] of the scene, [N] bool."""
 
 
 def layers_of(shading: ShadingModel) -> tuple[str, ...]:
-    """Names of the layers of Gaussians that are shaded like this, in the order of ``LAYERS``; then ``POLARIZED`` where
-    it predicts that.
-    """
+    """Return the layers of a shading model in the order of ``LAYERS``, then ``POLARIZED`` if it predicts them."""
     predicts = {"specular", "diffuse", "normal"} <= {*shading.layers}
     return (*(name for name in LAYERS if name in shading.layers), *(POLARIZED if predicts else ()))
 
@@ -54,37 +52,37 @@ class GaussianModel:
     def of(
         cls, state: TrainingState, recipe: Recipe, settings: ResolvedSettings, backend: Backend
     ) -> GaussianModel:
-        """The model of a training's state."""
+        """Return the model of a training's state."""
         return cls(state, recipe.shading.bind(settings.refractive_index), backend)
 
     @property
     def device(self) -> torch.device:
-        """Where layers are rendered."""
+        """Device of the rendered layers."""
         return self.backend.device
 
     @property
     def light(self) -> dict[str, Tensor]:
-        """Parameters of the learned light by name; empty for a recipe without."""
+        """Parameters of the learned light by name; empty for a recipe without light."""
         return self.state.light
 
     @property
     def layers(self) -> tuple[str, ...]:
-        """Names of the layers that it renders, in the order of ``LAYERS``."""
+        """Names of the rendered layers, in the order of ``LAYERS``."""
         return layers_of(self.shading)
 
     @property
     def steps(self) -> int:
-        """How many steps it has been trained for."""
+        """Number of trained steps."""
         return self.state.step
 
     @property
     def gaussians(self) -> int:
-        """How many Gaussians it has."""
+        """Number of Gaussians."""
         return len(self.state.gaussians)
 
     @property
     def size(self) -> str:
-        """How large it is, for people."""
+        """Number of Gaussians as text."""
         return f"{self.gaussians:,} Gaussians"
 
     @torch.no_grad()
@@ -97,12 +95,14 @@ class GaussianModel:
         surface: bool = False,
         within: Within | None = None,
     ) -> RenderResult:
-        """All layers.
+        """Render all layers.
 
         Args:
-            camera: any. normals: also where the model can do without them. depth: whether to render it.
+            camera: any camera.
+            normals: render normals even if the model does not need them.
+            depth: render the depth.
             surface: normals and depth are those of the surface at the pixel's median depth, see ``raster.surface``.
-            within: which places [N, 3] of the scene are shown, [N] bool; None: all.
+            within: returns the visible ones of places [N, 3] of the scene, [N] bool; None: all are visible.
         """
         gaussians: Parameters = self.state.gaussians
         footprints = self.state.footprints
@@ -122,14 +122,14 @@ class GaussianModel:
 
     @torch.no_grad()
     def stokes(self, result: RenderResult, camera: Camera) -> Tensor | None:
-        """The Stokes vectors [3, H, W, 3] that a rendered picture predicts; None without both layers and a normal."""
+        """Return the predicted Stokes vectors [3, H, W, 3] of a picture; None without both layers and a normal."""
         if not result.is_polarized:
             return None
         return self.shading.predicted_stokes(result, camera)
 
     @torch.no_grad()
     def alpha_in_front(self, camera: Camera, depth: Tensor) -> Tensor:
-        """Share of each pixel's alpha that lies nearer than a depth [H, W], see ``raster.surface``."""
+        """Return the share of each pixel's alpha that is nearer than a depth [H, W], see ``raster.surface``."""
         drawn = splats(self.state.gaussians)
         footprints = self.state.footprints
         if footprints is not None:
@@ -139,14 +139,16 @@ class GaussianModel:
 
 @torch.no_grad()
 def gaussian_colors(gaussians: Parameters, light: Light, shading: ShadingModel, directions: Tensor) -> Tensor:
-    """Linear colors of every Gaussian toward viewing directions, reflections included.
+    """Compute linear colors of every Gaussian toward viewing directions, with reflections.
 
     Args:
-        gaussians: the Gaussians. light: learned, by name. shading: shading of the recipe.
+        gaussians: the Gaussians.
+        light: learned light by name.
+        shading: shading of the recipe.
         directions: [K, 3] unit, from the camera to the Gaussian.
 
     Returns:
-        [N, K, 3]. Each Gaussian is shaded at its own normal, as far as a splat can carry a reflection.
+        [N, K, 3]. Each Gaussian is shaded at its own normal, the best that a splat can do for a reflection.
     """
     return torch.stack(_toward(gaussians, light, shading, directions), dim=1)
 
@@ -160,31 +162,32 @@ def baked_harmonics(
     present: Callable[[Tensor], Tensor],
     linear: bool,
 ) -> tuple[Tensor, Tensor]:
-    """Harmonics, as of ``refit_sh``, of ``gaussian_colors``.
+    """Return the harmonics of ``gaussian_colors``, see ``refit_sh``.
 
     Args:
         gaussians, light, shading: those of the run.
-        present: what becomes of linear colors. linear: whether they are still linear then.
+        present: maps linear colors to displayed ones.
+        linear: displayed colors are linear as well.
     """
-    known = {
+    parameters = {
         name: values
         for name in (*CORE_SHAPES, *shading.parameters)
         if (values := gaussians.get(name)) is not None
     }
-    means = known["means"].detach()
+    means = parameters["means"].detach()
     normals = shortest_axis_normals(
-        means, known["quaternions"].detach(), known["log_scales"].detach(), means.new_zeros(3)
+        means, parameters["quaternions"].detach(), parameters["log_scales"].detach(), means.new_zeros(3)
     )
 
     def colors(part: slice, directions: Tensor) -> Tensor:
-        some = {name: values.detach()[part] for name, values in known.items()}
-        return present(gaussian_colors(some, light, shading, directions))
+        batch = {name: values.detach()[part] for name, values in parameters.items()}
+        return present(gaussian_colors(batch, light, shading, directions))
 
     return refit_sh(colors, normals, srgb_slope if linear else None)
 
 
 def _toward(gaussians: Parameters, light: Light, shading: ShadingModel, directions: Tensor) -> list[Tensor]:
-    """``gaussian_colors`` direction by direction: K of [N, 3]."""
+    """Compute ``gaussian_colors`` direction by direction: K of [N, 3]."""
     means = gaussians["means"]
     center = means.new_zeros(3)
     normals = shortest_axis_normals(means, gaussians["quaternions"], gaussians["log_scales"], center)
@@ -199,11 +202,11 @@ def _toward(gaussians: Parameters, light: Light, shading: ShadingModel, directio
 
 @torch.no_grad()
 def learned_normals(gaussians: Parameters, centers: Tensor | None) -> Tensor:
-    """Unit normals of all Gaussians, [N, 3]: their shortest axes, turned toward the nearest camera.
+    """Return unit normals of all Gaussians, [N, 3]: their shortest axes, turned toward the nearest camera.
 
     Args:
         gaussians: the Gaussians.
-        centers: [M, 3] of the cameras, or None: then turned away from the middle of the Gaussians.
+        centers: [M, 3] camera centers; None: normals point away from the middle of the Gaussians.
     """
     means = gaussians["means"].detach().cpu()
     quaternions, log_scales = (gaussians[name].detach().cpu() for name in ("quaternions", "log_scales"))
@@ -228,13 +231,15 @@ def write_run_ply(
     linear: bool = False,
     own_fields: Mapping[str, Tensor] = MappingProxyType({}),
 ) -> None:
-    """Write the trained Gaussians; see the module's text, and ``learned_normals`` for the centers of the cameras.
+    """Write the trained Gaussians, see the module's text.
 
     Args:
-        path: the file. state, shading: those of the run. centers: [M, 3] of the cameras.
-        color: [3, 3] of a presentation; it holds for the harmonics that other programs show, never for our own fields.
-        linear: whether the harmonics are of linear colors, for readers that want them.
-        own_fields: fields [N, ...] behind those of the release, by name.
+        path: the file.
+        state, shading: those of the run.
+        centers: [M, 3] camera centers, see ``learned_normals``.
+        color: [3, 3] matrix of a presentation. It applies to the harmonics that other programs show, not to own fields.
+        linear: harmonics of linear colors, for readers that need them.
+        own_fields: further fields [N, ...] by name.
     """
     gaussians = state.gaussians
 

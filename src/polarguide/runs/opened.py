@@ -35,13 +35,14 @@ Opened = TypeVar("Opened", bound="OpenedRun")
 
 
 class OpenedRun:
-    """A trained run: what it was trained as, what it learned, and the layers that it renders.
+    """A trained run: its configuration, its model, and its layers.
 
     Args:
         folder: folder of the run.
-        configuration: what it was trained as. recipe: the method.
-        model: what it learned.
-        scene: the scene or its folder, where that is not the folder that the configuration names.
+        configuration: record of the training.
+        recipe: the method.
+        model: the trained model.
+        scene: the scene or its folder, if that is not the folder in the configuration.
         reporter: receives the progress of reading the scene.
     """
 
@@ -63,11 +64,11 @@ class OpenedRun:
         self._reporter = reporter
 
     def __repr__(self) -> str:
-        of = f"{self.recipe.name}, {self.steps} steps, {self.model.size}"
-        return f"<{type(self).__name__} {self.folder}: {of}\n polarization: {self._evidence()}>"
+        facts = f"{self.recipe.name}, {self.steps} steps, {self.model.size}"
+        return f"<{type(self).__name__} {self.folder}: {facts}\n polarization: {self._evidence()}>"
 
     def _evidence(self) -> str:
-        """``polarization``, also where its record is damaged: for representations, which raise nothing."""
+        """Return ``polarization``, or a text for a damaged record; representations raise no errors."""
         try:
             return self.polarization
         except PolarguideError as error:
@@ -83,13 +84,13 @@ class OpenedRun:
         device: DeviceName = "auto",
         reporter: Reporter = SILENT,
     ) -> Opened:
-        """Open a run folder. Warns if the recipe has other values now than it was trained with.
+        """Open a run folder. Warns if the recipe has changed since the training.
 
         Args:
-            folder: what a training wrote.
-            recipe: the recipe it was trained with, or its name, where that is not one of ours.
-            scene: the scene or its folder, where that has moved since; read on first use.
-            device: what to compute on.
+            folder: folder of a training.
+            recipe: the recipe of the training or its name, if it is not built in.
+            scene: the scene or its folder, if it was moved; read on first use.
+            device: device of the computation.
             reporter: receives the progress of long operations.
 
         Raises:
@@ -106,33 +107,33 @@ class OpenedRun:
         state = load_checkpoint(folder, method, backend.device)
         if method.differs(configuration.recipe_data):
             _warn(
-                f"{folder} was trained with other values of the recipe {method.name} than this version has; its "
-                "pictures are shaded with this version's."
+                f"{folder} was trained with other values of the recipe {method.name} than those of this version, "
+                "which shades its pictures."
             )
         model = GaussianModel.of(state, method, configuration.settings, backend)
         return cls(folder, configuration, method, model, scene=scene, reporter=reporter)
 
     @classmethod
     def of(cls: type[Opened], run: OpenedRun) -> Opened:
-        """An opened run as an instance of this class, which shares its scene and its model."""
+        """Convert an opened run to this class; both share the scene and the model."""
         scene = run._scene_source
         reporter = run._reporter
         return cls(run.folder, run.configuration, run.recipe, run.model, scene=scene, reporter=reporter)
 
     @property
     def steps(self) -> int:
-        """How many steps it has been trained for."""
+        """Number of trained steps."""
         return self.model.steps
 
     @property
     def gaussians(self) -> dict[str, Tensor]:
-        """Parameters by name, one row a Gaussian: ``means`` [N, 3], ``log_scales`` [N, 3], ... Not to be written to."""
+        """Parameters by name, one row per Gaussian: ``means`` [N, 3], ``log_scales`` [N, 3], ... Do not change them."""
         gaussians = self.model.state.gaussians
         return {name: gaussians[name].detach() for name in gaussians.names}
 
     @property
     def health(self) -> Health | None:
-        """Health of its training; None where it has not ended, or was one of an earlier version.
+        """Health of the training; None for an unfinished training, and for an earlier version.
 
         Raises:
             PolarguideError: ``health.json`` is not such a record.
@@ -141,23 +142,25 @@ class OpenedRun:
 
     @property
     def polarization(self) -> str:
-        """The evidence behind layers and normals, for people: ``measured``, ``fitted`` or ``none``, with its
-        exceptions. ``not recorded`` where there is no ``health``.
+        """Evidence behind layers and normals as text: ``measured``, ``fitted`` or ``none``, with exceptions.
+
+        ``not recorded`` without ``health``.
         """
         health = self.health
         return "not recorded" if health is None else health.polarization.text
 
     @property
     def light(self) -> dict[str, Tensor]:
-        """The learned light's parameters, such as ``texels`` [6, R, R, C] raw; empty for a recipe without."""
+        """Parameters of the learned light, such as raw ``texels`` [6, R, R, C]; empty for a recipe without light."""
         return {name: values.detach() for name, values in self.model.light.items()}
 
     @cached_property
     def scene(self) -> Scene:
-        """The scene it was trained on, read on first use. Warns if it has changed since.
+        """The scene of the training, read on first use. Warns if it has changed since.
 
         Raises:
-            PolarguideError: the scene was moved or deleted, cannot be read, or was read otherwise for training.
+            PolarguideError: the scene was moved or deleted, cannot be read, or was read with other options for
+                training.
         """
         configuration = self.configuration
         scene = self._scene_source
@@ -171,7 +174,9 @@ class OpenedRun:
                 f"downscale {options.downscale}, transfer {options.transfer}, as {self.folder} was trained"
             )
             reading = f"downscale {scene.downscale}, transfer {scene.transfer}"
-            raise PolarguideError("scene", expected=expected, found=reading, remedy="Load it like that.")
+            raise PolarguideError(
+                "scene", expected=expected, found=reading, remedy="Load it with these options."
+            )
         if scene.digest != configuration.scene_digest:
             _warn(f"{scene.root} has changed since {self.folder} was trained on it.")
         if recorded != scene.test_names:
@@ -181,36 +186,38 @@ class OpenedRun:
 
     @property
     def scene_folder(self) -> Path:
-        """Where the scene is, or was when it was trained on."""
+        """Folder of the scene, or its folder at the time of the training."""
         source = self._scene_source
         return source.root if isinstance(source, Scene) else Path(source or self.configuration.scene)
 
     @property
     def scene_is_there(self) -> bool:
-        """True where the scene is in memory or in its folder."""
+        """True if the scene is in memory or in its folder."""
         return self._holds_scene or self.scene_folder.is_dir()
 
     @property
     def new_place(self) -> str:
-        """The remedy for a scene that was moved."""
-        return f"If it was moved, say where it is: {command('present', self.folder, '--scene', 'NEWPLACE')}."
+        """Remedy for a scene that was moved."""
+        return (
+            f"If it was moved, specify its place: {command('present', self.folder, '--scene', 'NEWPLACE')}."
+        )
 
     def point_to(self, scene: PathLike) -> None:
-        """Record in ``run.json`` where the scene of the run lies now.
+        """Record the new folder of the scene in ``run.json``.
 
         Raises:
-            PolarguideError: there is no scene, or another than that of the training.
+            PolarguideError: the folder has no scene, or another one than that of the training.
         """
         moved = OpenedRun(self.folder, self.configuration, self.recipe, self.model, scene=scene)
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", PolarguideWarning)  # of a scene that has changed: an error here
+            warnings.simplefilter("ignore", PolarguideWarning)  # a changed scene is an error here
             digest = moved.scene.digest
         if digest != self.configuration.scene_digest:
             raise PolarguideError(
                 scene,
                 expected=f"the scene that {self.folder} was trained on",
-                found="another, or one that has changed since",
-                remedy="Give the folder to which it was moved, as it was.",
+                found="another scene, or a changed one",
+                remedy="Specify the folder of the unchanged scene.",
             )
         self.configuration = replace(self.configuration, scene=str(Path(scene).resolve()))
         with writing_to(self.folder):
@@ -219,7 +226,7 @@ class OpenedRun:
 
     @property
     def presentation(self) -> Presentation:
-        """How the run is presented: its own ``presentation.json`` over that of its scene, as they are now.
+        """Presentation of the run: its own ``presentation.json`` over that of its scene, as they are now.
 
         Raises:
             PolarguideError: a file is not such a record.
@@ -228,19 +235,19 @@ class OpenedRun:
 
     @cached_property
     def camera_frame(self) -> SceneFrame:
-        """The frame of the scene's cameras, with up as they say; reads their poses, not their pictures.
+        """Frame of the scene's cameras, with their up direction; reads their poses, not their pictures.
 
         Raises:
-            PolarguideError: the scene is not there any more, or has no such poses.
+            PolarguideError: the scene does not exist any more, or has no such poses.
         """
         return scene_frame([*self.poses.values()])
 
     @cached_property
     def poses(self) -> dict[str, Camera]:
-        """Cameras of the scene's views by name, of stored or of read pictures; reads no pictures itself.
+        """Cameras of the scene's views by name, without the pictures.
 
         Raises:
-            PolarguideError: the scene is not there any more, or has no such poses.
+            PolarguideError: the scene does not exist any more, or has no such poses.
         """
         if self._holds_scene:
             return self.cameras
@@ -250,10 +257,10 @@ class OpenedRun:
 
     @property
     def has_masks(self) -> bool:
-        """True where the scene has masks of the foreground.
+        """True if the scene has masks of the foreground.
 
         Raises:
-            PolarguideError: the scene is not there any more.
+            PolarguideError: the scene does not exist any more.
         """
         if self._holds_scene:
             return any(view.mask is not None for view in self.scene.views)
@@ -264,16 +271,16 @@ class OpenedRun:
         return "scene" in self.__dict__ or isinstance(self._scene_source, Scene)
 
     def _folder_to_read(self) -> Path:
-        """``scene_folder``, for what is read from it.
+        """Return ``scene_folder``, to read from it.
 
         Raises:
-            PolarguideError: the scene was one of arrays, and has no folder; or it is not there any more.
+            PolarguideError: the scene consists of arrays and has no folder, or the folder does not exist any more.
         """
         folder = self.scene_folder
         if self._scene_source is None and folder != IN_MEMORY and not folder.exists():
             raise PolarguideError(
                 folder,
-                expected=f"the scene of {self.folder}, whose {CONFIGURATION} names this place",
+                expected=f"the scene of {self.folder} according to its {CONFIGURATION}",
                 found="nothing",
                 remedy=self.new_place,
             )
@@ -282,13 +289,13 @@ class OpenedRun:
                 "scene",
                 expected=f"the scene of arrays that {self.folder} was trained on",
                 found="none",
-                remedy="Make it again, and give it: polarguide.open_run(folder, scene=scene).",
+                remedy="Create it again, and pass it: polarguide.open_run(folder, scene=scene).",
             )
         return folder
 
     @property
     def frame(self) -> SceneFrame:
-        """``camera_frame``, with the up axis of the presentation where one was chosen."""
+        """``camera_frame``, with the up axis of the presentation if it has one."""
         return self.presentation.upright(self.camera_frame)
 
     @property
@@ -298,7 +305,7 @@ class OpenedRun:
 
     @property
     def layers(self) -> tuple[str, ...]:
-        """Names of the layers that this run renders, in the order of ``LAYERS`` and ``POLARIZED``."""
+        """Names of the rendered layers, in the order of ``LAYERS`` and ``POLARIZED``."""
         return self.model.layers
 
     def result(
@@ -311,15 +318,14 @@ class OpenedRun:
         polarized: bool = False,
         within: Within | None = None,
     ) -> RenderResult:
-        """Everything that can be rendered, as one typed record on the run's device.
+        """Render all requested data as one typed record on the run's device.
 
         Args:
             camera: any camera, or the name of a view (then the scene is read).
-            normals, depth: whether to render these layers where the recipe can do without them.
-            surface: whether they are those of the surface at the pixel's median depth; otherwise blended, which is
-                faster.
-            polarized: whether to predict Stokes vectors, where the model can.
-            within: which places [N, 3] of the scene are shown, [N] bool; None: all.
+            normals, depth: render these layers even if the recipe does not need them.
+            surface: they are those of the surface at the pixel's median depth; otherwise blended, which is faster.
+            polarized: predict Stokes vectors, if the model supports it.
+            within: returns the visible ones of places [N, 3] of the scene, [N] bool; None: all are visible.
         """
         chosen = self.scene.view(camera).camera if isinstance(camera, str) else camera
         result = self.model.render(chosen, normals=normals, depth=depth, surface=surface, within=within)
@@ -327,7 +333,7 @@ class OpenedRun:
         return result if stokes is None else result.with_layers(**polarized_layers(stokes))
 
     def render(self, camera: Camera | str, layers: Iterable[str] = ("final",)) -> dict[str, Tensor]:
-        """Layers of a picture.
+        """Render layers of a picture.
 
         Args:
             camera: any camera, or the name of a view (then the scene is read).
@@ -335,12 +341,12 @@ class OpenedRun:
 
         Returns:
             By name: linear radiance [H, W, 3] on the scale of S0/2, world normals [H, W, 3] of any length, or [H, W]
-            for strength, roughness, metalness, depth and alpha. Predicted polarization: ``stokes`` [3, H, W, 3] in the
-            lens frame, as ``View.stokes`` measures it; ``dolp`` [H, W] in [0, 1] and ``aolp`` [H, W] radians in
-            [0, pi) of its luminance.
+                for strength, roughness, metalness, depth and alpha. Predicted polarization: ``stokes`` [3, H, W, 3] in
+                the lens frame, as ``View.stokes`` measures it; ``dolp`` [H, W] in [0, 1] and ``aolp`` [H, W] radians in
+                [0, pi) of its luminance.
 
         Raises:
-            PolarguideError: there is no such layer, or this recipe has not got it.
+            PolarguideError: a layer is unknown, or this recipe does not render it.
         """
         names = checked_layers([layers] if isinstance(layers, str) else list(layers))
         geometry = {"normal", "depth"} & {*names}
@@ -348,10 +354,10 @@ class OpenedRun:
         return self.chosen_layers(result, names)
 
     def chosen_layers(self, result: RenderResult, names: Iterable[str]) -> dict[str, Tensor]:
-        """Layers of a picture by name.
+        """Return layers of a picture by name.
 
         Raises:
-            PolarguideError: this recipe has not got one of them.
+            PolarguideError: this recipe does not render one of them.
         """
         names = list(names)
         absent = [name for name in names if name not in result.layers]
@@ -359,17 +365,17 @@ class OpenedRun:
             raise PolarguideError(
                 "layers",
                 expected=f"layers of the recipe {self.recipe.name}",
-                found=f"{', '.join(absent)}, which it has not",
-                remedy="Leave out the layers that it does not have.",
+                found=", ".join(absent),
+                remedy="Leave these layers out.",
             )
         return {name: result.layers[name] for name in names}
 
 
 def checked_layers(names: list[str]) -> list[str]:
-    """The names, if there is at least one and each is a layer's.
+    """Check that names are one or more names of layers, and return them.
 
     Raises:
-        PolarguideError: otherwise.
+        PolarguideError: a name is unknown, or there is no name.
     """
     for name in names or ["none"]:
         check_choice("layers", name, (*LAYERS, *POLARIZED))
@@ -384,11 +390,13 @@ def read_scene(
     *,
     hold: bool = True,
 ) -> Scene:
-    """Load a scene, with progress, and hand on its warnings.
+    """Load a scene with progress, and report its warnings.
 
     Args:
-        folder: folder of the scene. options: how it is read. reporter: receives progress.
-        test_views, hold: as for ``load_scene``.
+        folder: folder of the scene.
+        options: options of reading.
+        reporter: receives progress.
+        test_views, hold: see ``load_scene``.
 
     Raises:
         PolarguideError: the scene cannot be read.
@@ -409,7 +417,7 @@ def read_scene(
 
 
 def trained_scene(scene: Scene, settings: TrainSettings | ResolvedSettings) -> Scene:
-    """The scene with the exposures and the background that a training with these settings uses."""
+    """Return the scene with the exposures and the background of a training with these settings."""
     chosen = select_exposures(scene, settings.exposures)
     return mask_background(chosen) if settings.background == "masked" else chosen
 

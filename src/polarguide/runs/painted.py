@@ -1,6 +1,6 @@
-"""Materials that were painted over a run: RUN/materials/<view>.png, numbered as those of a scene.
+"""Materials that were painted over a run: RUN/materials/<view>.png, with the numbers of the scene's materials.
 
-They have the size of the views that were trained on, and count before those of the scene.
+They have the size of the training views, and take precedence over those of the scene.
 """
 
 from __future__ import annotations
@@ -22,7 +22,9 @@ from polarguide.core.errors import PolarguideError
 from polarguide.core.files import atomic_folder, read_file
 
 FOLDER = "materials"
-LARGEST = 1 << 26  # bytes of a picture
+"""Name of their folder in a run folder."""
+LARGEST = 1 << 26
+"""Largest size of a picture in bytes."""
 REMEDY = "Paint and save again in polarguide view RUN, or remove the folder."
 
 
@@ -31,7 +33,7 @@ class PaintedMaterials:
     """Pictures of materials.
 
     Attributes:
-        numbers: [H, W] uint8 of each view: 0 nothing, 1 dielectric, 2 metal, from 3 on those of ``scene.json``.
+        numbers: [H, W] uint8 by view: 0 no label, 1 dielectric, 2 metal, from 3 on those of ``scene.json``.
         digest: SHA-256 of the files.
     """
 
@@ -39,53 +41,53 @@ class PaintedMaterials:
     digest: str
 
     def over(self, scene: Scene) -> Scene:
-        """A scene whose views have these materials where they say anything."""
+        """Return a scene with these materials on labeled pixels."""
         views = []
         for view in scene.views:
-            own = view.materials
+            materials = view.materials
             painted = self.numbers.get(view.name)
             if painted is not None:
-                own = painted if own is None else torch.where(painted > 0, painted, own)
-            views.append(replace(view, materials=own))
+                materials = painted if materials is None else torch.where(painted > 0, painted, materials)
+            views.append(replace(view, materials=materials))
         return replace(scene, views=tuple(views))
 
 
 def read_painted(run: Path, scene: Scene) -> PaintedMaterials | None:
-    """Materials that were painted over a run of a scene; None: there are no pictures, or they say nothing.
+    """Read the materials that were painted over a run; None without a label.
 
     Raises:
-        PolarguideError: a picture belongs to no view or to one that is held out, is damaged, of another size, or has a
-            number that ``scene.json`` does not explain.
+        PolarguideError: a picture belongs to no view or to a held-out view, is damaged, has another size, or has a
+            number that ``scene.json`` does not define.
     """
-    if not os.path.lexists(run / FOLDER):  # a link to nowhere is no absence
+    if not os.path.lexists(run / FOLDER):  # a broken link is an error, not a missing folder
         return None
     digest = hashlib.sha256()
     numbers = dict[str, Tensor]()
-    known = {0, 1, 2, *scene.indices}
+    defined = {0, 1, 2, *scene.indices}
     for name, path in sorted(index_files(run / FOLDER, SUFFIXES).items()):
         camera = scene.view(name).camera
         data = read_file(path, largest=LARGEST, remedy=REMEDY)
         picture = torch.from_numpy(decode_materials(path, data))
         size = (camera.height, camera.width)
-        found = tuple(picture.shape)
-        if found != size:
+        shape = tuple(picture.shape)
+        if shape != size:
             raise PolarguideError(
                 path,
-                expected=f"{camera.width}x{camera.height} pixels, as the view was trained",
-                found=f"{found[1]}x{found[0]}",
+                expected=f"{camera.width}x{camera.height} pixels, the size of the training view",
+                found=f"{shape[1]}x{shape[0]}",
                 remedy=REMEDY,
             )
-        if unknown := set(picture.unique().tolist()) - known:
-            listed = ", ".join(map(str, sorted(known)))
+        if unknown := set(picture.unique().tolist()) - defined:
+            listed = ", ".join(map(str, sorted(defined)))
             raise PolarguideError(
                 path, expected=f"the numbers {listed}", found=str(min(unknown)), remedy=REMEDY
             )
         if name in scene.test_names and bool(picture.any()):
             raise PolarguideError(
                 path,
-                expected="a view that is trained on",
-                found=f"{name}, which is held out for tests: what is painted there would change nothing",
-                remedy="Paint a view that is trained on, in polarguide view RUN, and remove this picture.",
+                expected="a training view",
+                found=f"{name}, which is held out for tests, so that its materials have no effect",
+                remedy="Paint a training view in polarguide view RUN, and remove this picture.",
             )
         digest.update(name.encode() + b"\0" + picture.numpy().tobytes())
         numbers[name] = picture
@@ -94,13 +96,14 @@ def read_painted(run: Path, scene: Scene) -> PaintedMaterials | None:
 
 
 def write_painted(run: Path, numbers: Mapping[str, Tensor]) -> None:
-    """Write materials of a run over those that it has.
+    """Replace the painted materials of a run.
 
     Args:
+        run: the run folder.
         numbers: [H, W] uint8 of every training view.
 
     Raises:
-        PolarguideError: the materials cannot be written; those of before stay.
+        PolarguideError: the materials cannot be written; the previous ones remain.
     """
     with atomic_folder(run / FOLDER) as folder:
         for name, picture in numbers.items():

@@ -33,12 +33,11 @@ from polarguide.runs.folder import (
     save_checkpoint,
     writing_to,
 )
-from polarguide.runs.health import HealthCheck, RecordedWarnings
+from polarguide.runs.health import HealthCheck, MetalReport, PlyFile, PolarizerReport, RecordedWarnings
 from polarguide.runs.memory_plan import MemoryPlan, pixels_of, plan_memory
 from polarguide.runs.model import GaussianModel
 from polarguide.runs.opened import OpenedRun, read_scene, trained_scene
 from polarguide.runs.painted import FOLDER, read_painted
-from polarguide.runs.reports import MetalReport, PlyFile, PolarizerReport
 from polarguide.training.angles.fits import gaussian_training
 from polarguide.training.callback import AnyCallback
 from polarguide.training.context import TrainingContext
@@ -112,7 +111,7 @@ def train_gaussians(
             if leads:
                 stack.enter_context(writing_to(out))
             state = _resumed_state(out, method, configuration, reporter, leads=leads)
-        return_freed_memory()  # of decoded files
+        return_freed_memory()  # of decoding
         store = stack.enter_context(closing(view_store(plan, backend, out, reporter)))
         bound = MemoryBound(plan.peak)
         context = TrainingContext(loaded, method, resolved, backend, ranks, store, bound, reporter)
@@ -225,12 +224,12 @@ def unsuitable_folder(out: Path, resume: bool) -> PolarguideError | None:
         return error
     if os.path.lexists(out / CONFIGURATION) == resume:
         return None
-    expected, found, remedy = (
+    expected, actual, remedy = (
         ("a run to resume", "no run.json", "Train without --resume, or name the folder of a run.")
         if resume
         else ("a new folder", "a run", "Add --resume (resume=True) to continue it, or name another folder.")
     )
-    return PolarguideError(out, expected=expected, found=found, remedy=remedy)
+    return PolarguideError(out, expected=expected, found=actual, remedy=remedy)
 
 
 def check_trainable(scene: Scene) -> None:

@@ -1,7 +1,4 @@
-"""Callbacks of the training of Gaussians that belong to a method.
-
-Changes of Gaussians between steps: resets, normal propagation, outward directions, pixel counts.
-"""
+"""Callbacks of the training of Gaussians that belong to a method, and the changes of Gaussians that they make."""
 
 from __future__ import annotations
 

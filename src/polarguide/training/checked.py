@@ -42,8 +42,8 @@ class TensorRule:
             ValueError: it has another shape, type or range; the message names it.
         """
         if values.dtype != self.dtype or tuple(values.shape) != self.shape:
-            found = f"{list(values.shape)}, {values.dtype}"
-            raise ValueError(f"{name} of shape {found}, not {list(self.shape)}, {self.dtype}")
+            actual = f"{list(values.shape)}, {values.dtype}"
+            raise ValueError(f"{name} of shape {actual}, not {list(self.shape)}, {self.dtype}")
         if values.numel():
             low, high = (float(end) for end in values.aminmax())
             if not (low >= self.low and high <= self.high):  # false for NaN

@@ -1,5 +1,4 @@
-"""Processes that torchrun started for one training: their shares of views, sums of their results, and loss of a
-process.
+"""Processes of one training, started by torchrun: shares of views, sums of results, and loss of a process.
 
 A step renders B views in its slots 0 to B - 1. Each rank takes a range of them. Sums over slots are computed in the
 order of the ranks, for every communication backend, so that two processes of one view each give the bits of one process
@@ -75,9 +74,9 @@ class Ranks:
     def slots(self, views: int, rank: int | None = None) -> range:
         """Return the slots of a step's ``views`` of a rank; the first ranks take the remainder."""
         rank = self.rank if rank is None else rank
-        base, more = divmod(views, self.world)
-        begin = rank * base + min(rank, more)
-        return range(begin, begin + base + (rank < more))
+        base, remainder = divmod(views, self.world)
+        begin = rank * base + min(rank, remainder)
+        return range(begin, begin + base + (rank < remainder))
 
     def all_reduce(self, tensors: Sequence[Tensor]) -> None:
         """Replace each tensor by its sum over the ranks, in their order."""
@@ -134,16 +133,16 @@ class SeveralRanks(Ranks):
             t.copy_(values.view_as(t))
 
     def exchange_slots(self, sums: Tensor) -> None:
-        most = len(self.slots(len(sums), 0))
-        own = sums.new_zeros(most, *sums.shape[1:])
+        largest = len(self.slots(len(sums), 0))
+        own = sums.new_zeros(largest, *sums.shape[1:])
         slots = self.slots(len(sums))
         own[: len(slots)] = sums[slots.start : slots.stop]
-        gathered = sums.new_empty(self.world * most, *sums.shape[1:])
+        gathered = sums.new_empty(self.world * largest, *sums.shape[1:])
         with _collective():
             _gather(gathered, own)
         for rank in range(self.world):
             slots = self.slots(len(sums), rank)
-            sums[slots.start : slots.stop] = gathered[rank * most : rank * most + len(slots)]
+            sums[slots.start : slots.stop] = gathered[rank * largest : rank * largest + len(slots)]
 
     def broadcast(self, tensor: Tensor) -> None:
         with _collective():
@@ -221,10 +220,10 @@ class _Monitor:
     def __init__(self, ranks: SeveralRanks, out: Path) -> None:
         self._ranks = ranks
         self._out = out
-        everyone: list[tuple[str, int]] = [("", 0)] * ranks.world
-        here = socket.gethostname()
-        dist.all_gather_object(everyone, (here, os.getpid()))
-        self._pids = {rank: pid for rank, (host, pid) in enumerate(everyone) if host == here}
+        processes: list[tuple[str, int]] = [("", 0)] * ranks.world
+        host_name = socket.gethostname()
+        dist.all_gather_object(processes, (host_name, os.getpid()))
+        self._pids = {rank: pid for rank, (host, pid) in enumerate(processes) if host == host_name}
         self._stop = threading.Event()
         threading.Thread(target=self._poll, daemon=True).start()
 

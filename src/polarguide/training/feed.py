@@ -35,15 +35,15 @@ def is_complete(entry: Entry, fields: frozenset[str]) -> bool:
 
 def pack_priors(priors: ViewPriors, fields: Collection[str]) -> Entry:
     """Pack the requested fields of priors, and all fields that no built-in term reads."""
-    wanted = {
+    selected = {
         name: values
         for name, values in vars(priors).items()
         if isinstance(values, Tensor) and (name in fields or name not in Weights.known_priors())
     }
     if priors.candidates is not None:
-        wanted.pop("normal", None)  # each step chooses among the candidates
+        selected.pop("normal", None)  # each step chooses among the candidates
     # No term reads S0.
-    return {name: packed(values[1:] if name == "stokes" else values) for name, values in wanted.items()}
+    return {name: packed(values[1:] if name == "stokes" else values) for name, values in selected.items()}
 
 
 def unpack_priors(entry: Entry, camera: Camera, settings: Priors) -> ViewPriors:
@@ -183,8 +183,8 @@ class Feed:
         entry = self._store.get(size + "unguided", view.name, make, disposable=True)
         precomputed = Unguided(**{name: part.codes for name, part in entry.items()})
         flat = self._flat_surfaces(size).get(view.name)
-        own = index_picture(self.guide, view.camera, rasterize, self._index)
-        index = self._index if own is None else own
+        indices = index_picture(self.guide, view.camera, rasterize, self._index)
+        index = self._index if indices is None else indices
         priors = view_priors(view, normal, self._settings, index, precomputed, metal, flat)
         return pack_priors(priors, fields)
 
@@ -200,5 +200,5 @@ class Feed:
 
 def coarse_steps(recipe: Recipe, views: Sequence[View], steps: int) -> int:
     """Return the number of steps at the beginning that use smaller pictures; 0 for small captures."""
-    most = max((view.camera.width * view.camera.height for view in views), default=0)
-    return round(recipe.coarse.share * steps) if most > recipe.coarse.pixels else 0
+    largest = max((view.camera.width * view.camera.height for view in views), default=0)
+    return round(recipe.coarse.share * steps) if largest > recipe.coarse.pixels else 0

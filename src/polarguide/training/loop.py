@@ -157,13 +157,13 @@ class TrainingLoop(Loop):
 
 def requested_layers(stage: Stage, sh_degree: int, statistic: ScreenStatistic | None) -> RenderRequest:
     """Return the layers that a step of a stage needs."""
-    weights = stage.weights
-    fades = stage.behind is not None and weights.normals
+    layers = stage.weights.rendered
+    fades = stage.behind is not None and "normal" in layers
     return RenderRequest(
         sh_degree=sh_degree,
-        normals=weights.normals,
-        depth=weights.depth or fades,
-        layers_detached=stage.reflection and stage.hold_normals and weights.layers,
+        normals="normal" in layers,
+        depth="depth" in layers or fades,
+        layers_detached=stage.reflection and stage.hold_normals and "layers" in layers,
         normal_rotation_only=fades,
         statistic=statistic,
     )

@@ -1,11 +1,8 @@
 """Loss of one step: its terms, their inputs, and their weighted sum.
 
 A new term is a field of ``Weights``, with the rendered layers and the targets that it reads, and a function in
-``TERMS``.
-
-Native pass over the terms that compare normals, layers and depth per pixel, with its gradient.
-
-It takes float32 on the CPU. The functions in ``polarguide.training.losses`` are the reference implementation.
+``TERMS``. A native pass computes the terms on normals, layers and depth in float32 on the CPU; functions in plain torch
+are its reference implementation.
 """
 
 from __future__ import annotations
@@ -181,9 +178,7 @@ def pixel_terms(result: RenderResult, camera: Camera, terms: Terms) -> Tensor:
 
 
 def _field(result: RenderResult) -> Tensor | None:
-    """Return the metals' part of the specular layer and of its polarization over ``sin^2(zenith)``, [P, 6]; None: no
-    metal.
-    """
+    """Return the part [P, 6] of metals in the specular layer and in its polarization over ``sin^2(zenith)``."""
     if (metal := result.metal) is None:
         return None
     both = torch.cat((metal.specular, metal.slope * metal.specular), dim=1)
@@ -240,11 +235,6 @@ class Weights:
         """True if a term needs the priors of a view."""
         return any(use.metadata["priors"] and not use.metadata["optional"] for use in self._used())
 
-    @property
-    def normals(self) -> bool:
-        """True if a term reads the rendered normals."""
-        return self._read("normal")
-
     def own_terms(self) -> Sequence[Callable[[Step, Any], Tensor | None]]:
         """Return the terms of the weights that a subclass of another package adds.
 
@@ -253,14 +243,9 @@ class Weights:
         return ()
 
     @property
-    def depth(self) -> bool:
-        """True if a term reads the rendered depth."""
-        return self._read("depth")
-
-    @property
-    def layers(self) -> bool:
-        """True if a term reads single rendered layers."""
-        return self._read("layers")
+    def rendered(self) -> frozenset[str]:
+        """Layers that the terms read: "normal", "depth" or "layers"."""
+        return frozenset().union(*(use.metadata["rendered"] for use in self._used()))
 
     @property
     def fields_read(self) -> frozenset[str]:
@@ -274,9 +259,6 @@ class Weights:
 
     def _used(self) -> list[Field[Any]]:
         return [weight for weight in fields(self) if getattr(self, weight.name)]
-
-    def _read(self, rendered: str) -> bool:
-        return any(rendered in use.metadata["rendered"] for use in self._used())
 
 
 def depth_normals(depth: Tensor, camera: Camera) -> Tensor:
@@ -463,7 +445,7 @@ def refuse_diverged(total: Tensor) -> None:
             "training",
             expected="a finite loss",
             found=str(float(total.sum())),
-            remedy="Check the pictures and poses (polarguide inspect). For your own recipe, lower its rates.",
+            remedy="Check the pictures and poses (polarguide inspect). In your own recipe, lower the rates.",
         )
 
 

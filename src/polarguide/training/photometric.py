@@ -5,8 +5,8 @@ written out in plain torch, which blurs nine planes each way, where autograd wou
 results. ``photometric_terms_reference`` is the reference implementation.
 
 ``partial_terms`` is the loss of views whose pictures do not determine the Stokes vector: one polarizer angle, two, or
-none. The rendered layers predict S0, S1 and S2, and with them the intensity behind any analyzer, ``(S0 + S1 c + S2 s) /
-2``. The prediction is compared with the measured intensities.
+none. The rendered layers predict S0, S1 and S2, and with them the intensity behind any analyzer,
+``(S0 + S1 c + S2 s) / 2``. The prediction is compared with the measured intensities.
 """
 
 from __future__ import annotations

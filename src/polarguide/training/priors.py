@@ -3,12 +3,11 @@
 This is the coupling of PolarGuide-GSDR (Shan et al. 2026). The normals of the Gaussians resolve the ambiguity of the
 polarization normals and of the separation. The resulting priors supervise the Gaussians until the next refresh.
 
-Flat mirroring surfaces: large parts of a view whose polarization one normal explains.
-
-Light that a dielectric or a metal mirrors is polarized across the plane of incidence. The AoLP of a pixel therefore
-gives a direction perpendicular to its normal, for any mirrored light at any apparent depth. All pixels of a plane have
-one normal, and the directions of many pixels determine it up to its sign, which follows from the camera. Neither the
-ambiguity of pi nor that of pi/2 remains. Still water, which shows the depth of the mirrored scene, has no other cue.
+Flat mirroring surfaces have one normal that explains the polarization of a large part of a view. Light that a
+dielectric or a metal mirrors is polarized across the plane of incidence. The AoLP of a pixel therefore gives a
+direction perpendicular to its normal, for any mirrored light at any apparent depth. All pixels of a plane have one
+normal, and the directions of many pixels determine it up to its sign, which follows from the camera. Both
+ambiguities, of pi and of pi/2, vanish. Still water, which shows the depth of the mirrored scene, has no other cue.
 
 The planes of incidence of a sphere also meet in one line, the ray through its center. There Fresnel's equations allow
 almost no polarization, so that the measurement contradicts this normal.
@@ -67,13 +66,13 @@ def flat_surface(view: View, refractive_index: float, rules: FlatRules) -> Flat 
 
     pixels = good.numel()
     step = max(1, round((pixels / rules.samples) ** 0.5))
-    some = torch.zeros_like(good)
-    some[::step, ::step] = good[::step, ::step]
-    e = across[some]
-    d = rays[some]
-    dolp = degree[some]
-    least = rules.least * pixels / step**2
-    if len(e) < max(2.0, least):
+    sampled = torch.zeros_like(good)
+    sampled[::step, ::step] = good[::step, ::step]
+    e = across[sampled]
+    d = rays[sampled]
+    dolp = degree[sampled]
+    fewest = rules.least * pixels / step**2
+    if len(e) < max(2.0, fewest):
         return None
     pairs = torch.randint(len(e), (2, rules.tries), generator=torch.Generator().manual_seed(0))
     proposed = torch.linalg.cross(e[pairs[0]], e[pairs[1]])
@@ -89,7 +88,7 @@ def flat_surface(view: View, refractive_index: float, rules: FlatRules) -> Flat 
         _, vectors = torch.linalg.eigh(e[inside].T @ e[inside])
         normal = vectors[:, 0] * torch.sign(vectors[:, 0] @ normal)
         inside = _agrees(e @ normal, -(d @ normal), dolp, refractive_index, rules)
-    if float(inside.sum()) < least:
+    if float(inside.sum()) < fewest:
         return None
     everywhere = normal.expand_as(rays)
     where = good & _agrees(dot(across, everywhere), -dot(rays, everywhere), degree, refractive_index, rules)
@@ -120,7 +119,7 @@ def flat_surfaces(views: Iterable[View], refractive_index: float, rules: FlatRul
     """
     surfaces = dict[str, Flat]()
     determined = 0
-    for view in views:  # one by one, as they come
+    for view in views:
         if view.is_determined:
             determined += 1
             if (flat := flat_surface(view, refractive_index, rules)) is not None:
@@ -207,8 +206,8 @@ def guide_normals(normal: Tensor, rays: Tensor, least: float) -> tuple[Tensor, T
     """
     reliable = dot(normal, normal) > least**2
     facing = unit(normal)
-    away = dot(facing, rays)[..., None].clamp(min=0)
-    return unit(facing - away * 1.001 * rays), reliable
+    overshoot = dot(facing, rays)[..., None].clamp(min=0)
+    return unit(facing - overshoot * 1.001 * rays), reliable
 
 
 @torch.no_grad()
@@ -340,15 +339,15 @@ def _guide(view: View, normal: Tensor, flat: Flat | None, rays: Tensor, settings
 def _by_color(
     precomputed: Unguided, guide: _Guide, settings: Priors, rays: Tensor
 ) -> tuple[Tensor, Tensor] | None:
-    """Return the normals [H, W, 3] of color differences or of a flat surface, and their weight; None: not requested."""
+    """Return the normals [H, W, 3] of color differences or of a flat surface, and their weight; None without them."""
     _, _, zenith, azimuth, certainty, colorful = precomputed
     if zenith is None or azimuth is None or certainty is None or colorful is None:
         return None
     chromatic = facing(zenith, azimuth, guide.normal, rays)
     weight = certainty * guide.shown
     if settings.chromatic_within is not None:
-        near = _within(chromatic, guide.normal, *settings.chromatic_within)
-        weight = weight * torch.maximum(near, colorful)
+        nearness = _within(chromatic, guide.normal, *settings.chromatic_within)
+        weight = weight * torch.maximum(nearness, colorful)
     chromatic = torch.where(guide.astray[..., None], guide.on_plane, chromatic)
     return chromatic, torch.maximum(weight, guide.astray.to(weight))
 
@@ -378,11 +377,9 @@ def _across(luminance: Tensor, normal: Tensor, rays: Tensor) -> Tensor:
 
 
 def _within(normal: Tensor, guide: Tensor, full: float, none: float) -> Tensor:
-    """Return a weight [H, W] that falls from 1 at ``full`` degrees between unit normals [H, W, 3] to 0 at ``none``
-    degrees.
-    """
-    off = torch.linalg.cross(normal, guide).norm(dim=-1).atan2(dot(normal, guide)).rad2deg()
-    return ((none - off) / (none - full)).clamp(0, 1)
+    """Return a weight [H, W] that falls with the angle of unit normals, from 1 at ``full`` to 0 at ``none`` degrees."""
+    angle = torch.linalg.cross(normal, guide).norm(dim=-1).atan2(dot(normal, guide)).rad2deg()
+    return ((none - angle) / (none - full)).clamp(0, 1)
 
 
 def _noise(view: View) -> Tensor | float:

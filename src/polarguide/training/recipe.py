@@ -1,9 +1,7 @@
-"""Recipes as data: stages with their rendering, losses and actions.
+"""Recipes as data: stages with their rendering, losses and actions, and the constants of a method.
 
 Stage boundaries are fractions of the number of steps, so that the loop compares no step with a constant. ``Schedule``
 maps the stages of a recipe to the steps of a training.
-
-Constants of the detection of metals and flat surfaces, and of the fit of polarizer angles, as data of a recipe.
 """
 
 from __future__ import annotations
@@ -25,7 +23,7 @@ from polarguide.training.losses import Weights as Weights
 
 @dataclass(frozen=True)
 class MetalRules:
-    """Constants of the energy whose minimum decides on metals (``training.metals.cut``).
+    """Constants of the energy whose minimum decides on metals (``training.metals.search``).
 
     Attributes:
         prior: log likelihood ratio per view, in nats, by which a metal must be likelier than a dielectric.
@@ -204,8 +202,8 @@ class Rounds:
 
     def turns(self, length: int, steps: int) -> dict[int, Action]:
         """Return the due actions by step, counted from the beginning of a stage of ``length`` of ``steps`` steps."""
-        apart = max(1, self.minimum, round(self.fraction * steps))
-        count = len(self.actions) * max(1, length // (apart * len(self.actions)))
+        distance = max(1, self.minimum, round(self.fraction * steps))
+        count = len(self.actions) * max(1, length // (distance * len(self.actions)))
         places = (round(turn * length / count) for turn in range(1, count))
         return {at: self.actions[k % len(self.actions)] for k, at in enumerate(places) if 0 < at < length}
 
@@ -385,7 +383,7 @@ class Recipe:
 
     def __post_init__(self) -> None:
         share = sum(stage.fraction for stage in self.stages)
-        strangers = sorted(set(self.rates) - set(CORE_SHAPES))
+        unknown = sorted(set(self.rates) - set(CORE_SHAPES))
         factors = [
             *self.rates.items(),
             *(item for stage in self.stages for item in stage.rate_factors.items()),
@@ -401,7 +399,7 @@ class Recipe:
                 "rate factors of learned parameters",
                 f"{sorted(named)}",
             ),
-            (bool(strangers), f"rates of {', '.join(CORE_SHAPES)}", ", ".join(map(str, strangers))),
+            (bool(unknown), f"rates of {', '.join(CORE_SHAPES)}", ", ".join(map(str, unknown))),
             (
                 bool(wrong_rates),
                 "rates and rate factors that are finite and not negative",
@@ -475,8 +473,8 @@ def check_recipe(recipe: Recipe, where: str) -> None:
             place = f"{where} ({name})"
             raise PolarguideError(place, expected="a line of text", found=repr(text), remedy=_REMEDY)
     if not isinstance(recipe.shading, ShadingModel):
-        found = repr(recipe.shading)
-        raise PolarguideError(f"{where} (shading)", expected="a ShadingModel", found=found, remedy=_REMEDY)
+        actual = repr(recipe.shading)
+        raise PolarguideError(f"{where} (shading)", expected="a ShadingModel", found=actual, remedy=_REMEDY)
     _check_values(recipe, where, "")
     try:
         json.dumps(recipe.data(), allow_nan=False)

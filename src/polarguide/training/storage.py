@@ -7,15 +7,15 @@ a result does not depend on their storage. That is a hundredth of a degree of a 
 
 from __future__ import annotations
 
-import contextlib
 import tempfile
 import weakref
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, NamedTuple
 
 import torch
+from safetensors.torch import load, save
 from torch import Tensor
 
 FULL = 32767
@@ -57,22 +57,25 @@ def stored_values(entry: Packed) -> Tensor:
     """Return the values of a packed tensor; coded ones as float32."""
     if entry.top is None:
         return entry.codes
-    # A division by 32767 gives back a 1 exactly, a product with its inverse does not.
+    # Division by 32767 restores a 1 exactly; a product with its inverse does not.
     values = entry.codes.to(torch.float32).div_(FULL)
     return values if entry.top.device.type == "cpu" and float(entry.top) == 1 else values.mul_(entry.top)
 
 
-ALIGNED = 64
-"""Alignment of entries in the file, in bytes."""
-
-
 @dataclass
 class _FileSlot:
-    """Slot of an entry in the file: offset, size in bytes, and the type, shape and scale of each tensor."""
+    """Slot of an entry in the file.
+
+    Attributes:
+        offset, size: place of the slot in bytes.
+        length: bytes of the entry; 0: no entry.
+        tops: scales of the tensors by name.
+    """
 
     offset: int
     size: int
-    parts: dict[str, tuple[torch.dtype, tuple[int, ...], torch.Tensor | None]] | None = None
+    length: int = 0
+    tops: dict[str, Tensor | None] = field(default_factory=dict)
 
 
 class ViewStore:
@@ -98,7 +101,7 @@ class ViewStore:
         self._folder = folder
         self._warn = warn
         self._entries: dict[tuple[str, str], Entry] = {}
-        self._places: dict[tuple[str, str], _FileSlot] = {}
+        self._slots: dict[tuple[str, str], _FileSlot] = {}
         self._file: IO[bytes] | None = None
         self.in_memory = 0
         self.in_file = 0
@@ -126,14 +129,14 @@ class ViewStore:
         """
         for key in [key for key in self._entries if key[0] == kind and view in (None, key[1])]:
             self.in_memory -= _size(self._entries.pop(key))
-        for key, place in self._places.items():
+        for key, slot in self._slots.items():
             if key[0] == kind and view in (None, key[1]):
-                place.parts = None
+                slot.length = 0
 
     def close(self) -> None:
         """Drop all entries."""
         self._entries.clear()
-        self._places.clear()
+        self._slots.clear()
         self.in_memory = self.in_file = 0
         if self._file is not None:
             self._file.close()
@@ -146,51 +149,45 @@ class ViewStore:
             self.in_memory += size
         elif self._folder is not None and not disposable:
             try:
-                self._write(key, entry, size)
+                self._write(key, entry)
             except OSError as error:
-                self._places.pop(key, None)
+                self._slots.pop(key, None)
                 self._folder = None
                 self._warn(
                     f"the cache of per-view data cannot be written to a file ({error.strerror or error}). The data are "
                     "computed again in every step, which is slow. Free space on the disk, or increase --memory."
                 )
 
-    def _write(self, key: tuple[str, str], entry: Entry, size: int) -> None:
+    def _write(self, key: tuple[str, str], entry: Entry) -> None:
         if self._file is None:
-            self._file = tempfile.TemporaryFile(dir=self._folder, buffering=0)  # noqa: SIM115, until close
+            self._file = tempfile.TemporaryFile(dir=self._folder)  # noqa: SIM115, until close
             weakref.finalize(self, self._file.close)
-        place = self._places.get(key)
-        if place is None or place.size < size:
-            place = _FileSlot(self.in_file, size)
-            self.in_file += -(-size // ALIGNED) * ALIGNED
-            self._places[key] = place
-        place.parts = None
-        self._file.seek(place.offset)
-        for part in entry.values():
-            rest = memoryview(part.codes.contiguous().view(torch.uint8).numpy()).cast("B")
-            while rest:
-                rest = rest[self._file.write(rest) :]
-        place.parts = {name: (p.codes.dtype, tuple(p.codes.shape), p.top) for name, p in entry.items()}
+        data = save({name: part.codes.contiguous() for name, part in entry.items()})
+        slot = self._slots.get(key)
+        if slot is None or slot.size < len(data):
+            slot = _FileSlot(self.in_file, len(data))
+            self.in_file += len(data)
+            self._slots[key] = slot
+        slot.length = 0
+        self._file.seek(slot.offset)
+        self._file.write(data)
+        self._file.flush()
+        slot.length = len(data)
+        slot.tops = {name: part.top for name, part in entry.items()}
 
     def _read(self, key: tuple[str, str]) -> Entry | None:
         """Return an entry from the file; None if it is missing or cannot be read."""
-        place = self._places.get(key)
-        if place is None or place.parts is None or self._file is None:
+        slot = self._slots.get(key)
+        if slot is None or not slot.length or self._file is None:
             return None
-        entry = {}
-        with contextlib.suppress(OSError):
-            self._file.seek(place.offset)
-            for name, (kind, shape, top) in place.parts.items():
-                codes = torch.empty(shape, dtype=kind)
-                rest = memoryview(codes.view(torch.uint8).numpy()).cast("B")
-                while rest:
-                    count = self._file.readinto(rest)  # type: ignore[attr-defined]
-                    if not count:
-                        return None
-                    rest = rest[count:]
-                entry[name] = Packed(codes, top)
-            return entry
-        return None
+        try:
+            self._file.seek(slot.offset)
+            data = self._file.read(slot.length)
+        except OSError:
+            return None
+        if len(data) < slot.length:
+            return None
+        return {name: Packed(codes, slot.tops[name]) for name, codes in load(data).items()}
 
 
 def _size(entry: Entry) -> int:

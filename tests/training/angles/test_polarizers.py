@@ -18,7 +18,7 @@ from polarguide.capture.angle_evidence import mean_angle
 from polarguide.capture.exposures import FOUR, Exposure, read_table
 from polarguide.capture.variants import select_exposures
 from polarguide.recipes import RECIPES, recipe_named
-from polarguide.runs.reports import report_polarizers
+from polarguide.runs.health import report_polarizers
 from polarguide.training.angles.fits import gaussian_training
 from polarguide.training.angles.polarizers import Polarizers
 from polarguide.training.checked import refuse_foreign
@@ -186,7 +186,7 @@ def test_swapped_pictures_and_missing_filters_are_named(tmp_path: Path) -> None:
     polarizers = judged(with_exposures(dataclasses.replace(ones, views=tuple(views)), **said))
     found = {judgment.view: judgment for judgment in polarizers.judgments()}
     assert [name for name, judgment in found.items() if judgment.contradicts] == ["v1"]
-    assert abs(abs(found["v1"].off) - 90) < 1
+    assert abs(abs(found["v1"].estimate.off) - 90) < 1
     assert [name for name, judgment in found.items() if judgment.unfiltered] == ["v3"]
     assert polarizers.believed(ones.view("v1")).exposures == (Exposure(90.0),)  # it is said, so it holds
     warned = "\n".join(reported(tmp_path, ones, polarizers))

@@ -1,6 +1,6 @@
 """Polarizer angles as a training estimates them: unknown angles, and contradicted known ones.
 
-The angle and the gain of a picture behind a polarizer, in closed form from predicted Stokes vectors.
+The angle and the gain of a picture behind a polarizer follow in closed form from predicted Stokes vectors.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from torch import Tensor
 
 from polarguide import optics
 from polarguide.capture import Scene, View
-from polarguide.capture.angle_evidence import TO_DEVIATION, angle_difference, mean_angle, tolerance
+from polarguide.capture.angle_evidence import TO_DEVIATION, AngleEstimate, mean_angle
 from polarguide.capture.exposures import Exposure, with_estimate
 from polarguide.capture.view import ANGLES
 from polarguide.optics import Mount
@@ -110,7 +110,7 @@ def fit_angle(
     if gain <= 0 or length == 0:
         return None
     covariance = _covariance(columns, plain, y - solution @ columns, intensity.shape)
-    if mount == "filter":  # turned into the last round's analyzer, which is all but along the first axis
+    if mount == "filter":  # in the analyzer of the last round, the second component is almost 0
         x = length
         y2 = 0.0
     across = torch.tensor([0.0, -y2, x], dtype=torch.float64) / length
@@ -214,28 +214,19 @@ class Judgment(FittedAngle):
         return self.tells and self.unexplained > self.rules.poor
 
     @property
-    def off(self) -> float:
-        """Degrees from the specified to the fitted angle, in [-90, 90); 0 without a specified angle."""
-        return 0.0 if self.specified.angle is None else angle_difference(self.angle, self.specified.angle)
-
-    @property
-    def limit(self) -> float:
-        """Degrees of deviation beyond which a picture contradicts its specified angle.
-
-        It grows with the deviations of the other pictures, since large deviations of all pictures mean a wrong model.
-        From 90 on, no picture contradicts.
-        """
-        return tolerance(self.rules.contradicts, self.spread, self.usual)
+    def estimate(self) -> AngleEstimate:
+        """Comparison of the fitted angle with the specified one."""
+        floor = self.rules.contradicts
+        return AngleEstimate(self.angle, self.spread, self.specified.angle, floor, self.usual)
 
     @property
     def contradicts(self) -> bool:
-        """True if the picture contradicts its specified angle by more than its ``limit``."""
-        return not (self.unfiltered or self.overruled) and abs(self.off) > self.limit
+        """True if the picture contradicts its specified angle."""
+        return not (self.unfiltered or self.overruled) and self.estimate.contradicts
 
     def resembles(self, other: Judgment) -> bool:
         """Return True if the fitted angle equals the specified angle of another picture, within its spread."""
-        apart = angle_difference(self.angle, other.specified.angle or 0.0)
-        return abs(apart) <= tolerance(self.rules.contradicts, self.spread)
+        return not replace(self.estimate, stated=other.specified.angle or 0.0, usual=0.0).contradicts
 
     @property
     def doubtful(self) -> bool:
@@ -353,16 +344,16 @@ class Polarizers:
     def take(self, table: Tensor) -> set[str]:
         """Use a table of all fits [F, P, 8]; return the names of the views with changed exposures."""
         self.table = table
-        before = self.beliefs
+        earlier = self.beliefs
         self.beliefs = self._beliefs()
-        return {name for name, exposures in self.beliefs.items() if before.get(name) != exposures}
+        return {name for name, exposures in self.beliefs.items() if earlier.get(name) != exposures}
 
     def judgments(self) -> list[Judgment]:
         """Return the judgment of each picture; empty before the first fit."""
         if self.table is None:
             return []
         common = self._common_gain(self.table[-1])
-        # The fits of the latest search that has any; those of earlier ones are worse.
+        # Fits of the latest search only, because earlier ones are worse.
         ends = itertools.accumulate(map(len, self._rounds), initial=0)
         latest = self.table[max(end for end in ends if end < len(self.table)) :]
         fits = zip(*map(self._judged, latest), strict=True)
@@ -374,8 +365,8 @@ class Polarizers:
                 angles = [row.angle for row in telling]
                 spreads = [row.spread for row in telling]
                 angle, scatter = mean_angle(angles, spreads, self._rules.least_spread)
-                few = len(telling) < len(rows) / 2
-                judgment = replace(judgment, angle=angle, scatter=90.0 if few else scatter)
+                is_scattered = len(telling) < len(rows) / 2
+                judgment = replace(judgment, angle=angle, scatter=90.0 if is_scattered else scatter)
             if wrong := [row for row in rows if row.contradicts]:
                 judgment = replace(wrong[-1], unexplained=poor)
             judgments.append(
@@ -415,7 +406,7 @@ class Polarizers:
             )
             for (view, k), row in zip(self._places, fit.tolist(), strict=True)
         ]
-        offs = [abs(row.off) for row in rows if row.tells and row.specified.angle is not None]
+        offs = [abs(row.estimate.off) for row in rows if row.tells and row.specified.angle is not None]
         usual = median(offs) if offs else 0.0
         return [replace(row, usual=usual) for row in rows]
 

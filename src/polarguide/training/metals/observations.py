@@ -1,6 +1,6 @@
 """Measurements of each Gaussian by the views, and its labels in ``materials/``.
 
-Pixels count by what the Gaussian has in them.
+Pixels count by the blending weights of the Gaussian.
 """
 
 from __future__ import annotations
@@ -24,13 +24,19 @@ from polarguide.shading.model import Parameters
 from polarguide.training.priors import guide_normals
 from polarguide.training.recipe import MetalViews
 
-# Pixels in all views from which on a Gaussian is measured, or labeled.
 LEAST_PIXELS = 0.3
+"""Pixels in all views above which a Gaussian is measured or labeled."""
 
 
 class ViewSamples(NamedTuple):
-    """Means over what V views show of each Gaussian: weight [V, N], S0, P, the polarization at 45 degrees to both
-    [V, N, 3], cosine of the zenith [V, N].
+    """Means over the pixels of each Gaussian in V views.
+
+    Attributes:
+        weight: [V, N] sum of the blending weights.
+        s0: [V, N, 3] S0.
+        across: [V, N, 3] polarization P across the plane of incidence.
+        oblique: [V, N, 3] polarization at 45 degrees to that plane.
+        cosine: [V, N] cosine of the zenith angle.
     """
 
     weight: Tensor
@@ -43,30 +49,30 @@ class ViewSamples(NamedTuple):
 def view_sums(
     gaussians: Parameters, views: Iterable[View], rasterize: Rasterize, limits: MetalViews
 ) -> list[Tensor]:
-    """Sums [N, 11] over the pixels of each view; every view has to determine the Stokes vector. ``samples_of`` turns
-    them into means.
+    """Return sums [N, 11] over the pixels of each view, which ``samples_of`` converts to means.
+
+    Every view has to determine the Stokes vector.
     """
     return [_look(gaussians, view, rasterize, limits.least_normal) for view in views]
 
 
 def evenly(views: Sequence[View], most: int) -> Sequence[View]:
-    """At most so many of the views, every second, third or so."""
+    """Return at most ``most`` evenly spread views."""
     return views[:: max(1, -(-len(views) // most))]
 
 
 def shares(gaussians: Parameters, camera: Camera, target: Tensor, rasterize: Rasterize) -> Tensor:
-    """Sums [N, C] over the pixels of a picture [H, W, C], each by what the Gaussian has in it."""
+    """Return sums [N, C] over the pixels of a picture [H, W, C], weighted by the blending weights of each Gaussian."""
     with torch.no_grad():
         fixed = splats(gaussians)
     features = target.new_zeros(len(fixed.means), target.shape[-1], requires_grad=True)
     with torch.enable_grad():
-        (rasterize(fixed._replace(features=features), camera).features * target).sum().backward()
-    assert features.grad is not None
-    return features.grad
+        total = (rasterize(fixed._replace(features=features), camera).features * target).sum()
+        return torch.autograd.grad(total, features)[0]
 
 
 def _look(gaussians: Parameters, view: View, rasterize: Rasterize, least_normal: float) -> Tensor:
-    """Sums [N, 11] over a view's pixels: 1, S0, P, the polarization at 45 degrees to it and the cosine."""
+    """Return sums [N, 11] over the pixels of a view: 1, S0, P, the polarization at 45 degrees, and the cosine."""
     device = gaussians["means"].device
     normal = render(gaussians, view.camera, rasterize, RenderRequest(sh_degree=0)).normal
     view = view.to(device)
@@ -88,7 +94,7 @@ def _look(gaussians: Parameters, view: View, rasterize: Rasterize, least_normal:
 
 
 def samples_of(looks: Sequence[Tensor], which: slice, limits: MetalViews) -> ViewSamples:
-    """Means of the sums of some Gaussians, with the weight of views that count."""
+    """Return the means of the sums of some Gaussians, with weight 0 for views that do not count."""
     sums = torch.stack([look[which] for look in looks])
     weight = sums[..., 0]
     means = sums[..., 1:] / weight.clamp(min=1e-6)[..., None]
@@ -100,31 +106,31 @@ def samples_of(looks: Sequence[Tensor], which: slice, limits: MetalViews) -> Vie
 
 @torch.no_grad()
 def blended(gaussians: Parameters, values: Tensor, camera: Camera, rasterize: Rasterize) -> Tensor:
-    """A value of each Gaussian [N] as blended in a view, [H, W]."""
+    """Return a value of each Gaussian [N] as blended in a view, [H, W]."""
     return rasterize(splats(gaussians, values[:, None]), camera).features[..., 0]
 
 
 def metalness_share(gaussians: Parameters, camera: Camera, rasterize: Rasterize) -> Tensor | None:
-    """Blended metalness [H, W]; None where no Gaussian is a metal, or none can be."""
+    """Return the blended metalness [H, W]; None without metals."""
     metalness = gaussians.get("metalness")
     if metalness is None or not any_nonzero(gaussians, "metalness"):
         return None
     return blended(gaussians, metalness, camera, rasterize)
 
 
-def labeled_views(views: Iterable[View]) -> list[View]:
-    """Those of the views in which the user names materials."""
-    return [view for view in views if view.materials is not None]
+def labeled_views(views: Iterable[View]) -> list[tuple[View, Tensor]]:
+    """Return the views with labels of the user, and their labels [H, W]."""
+    return [(view, view.materials) for view in views if view.materials is not None]
 
 
 def label_weights(
     gaussians: Parameters, views: Iterable[View], rasterize: Rasterize, memory: MemoryBound = UNBOUNDED
 ) -> Tensor:
-    """Weight [N, 2] of the pixels that the user calls dielectric and metal, over the views."""
+    """Return the weight [N, 2] of the pixels that the user labels as dielectric and as metal, over the views."""
     means = gaussians["means"].detach()
     labels = means.new_zeros(len(means), 2)
-    for view in memory.between(labeled_views(views)):
-        labels += _labels_in(gaussians, view, rasterize)
+    for view, kinds in memory.between(labeled_views(views)):
+        labels += _labels_in(gaussians, view, kinds, rasterize)
     return labels
 
 
@@ -136,45 +142,55 @@ def contradicted(
     limits: MetalViews,
     memory: MemoryBound = UNBOUNDED,
 ) -> dict[str, float]:
-    """Views whose words the other views contradict, the most contradicted first, with the share of those words of
-    which others say anything.
+    """Find views whose labels other views contradict.
 
     Args:
-        labels: by all views, as of ``label_weights``.
+        gaussians: the Gaussians.
+        views: all views.
+        rasterize: rasterizer of the backend.
+        labels: [N, 2] result of ``label_weights`` for all views.
+        limits: constants of the search.
+        memory: returns freed memory to the system.
+
+    Returns:
+        By the name of the view, the share of its labels that others contradict, relative to those that others label as
+        well. The largest share comes first.
     """
-    views_contradicted = {}
-    for view in memory.between(labeled_views(views)):
-        own = _labels_in(gaussians, view, rasterize)
-        others = (labels - own).clamp(min=0)
-        own = own * (others.sum(dim=1, keepdim=True) > LEAST_PIXELS)
-        opposed = (own * (others.flip(1) > others)).sum()
-        share = float(opposed / own.sum().clamp(min=1e-6))
+    opposed_shares = {}
+    for view, kinds in memory.between(labeled_views(views)):
+        labels_here = _labels_in(gaussians, view, kinds, rasterize)
+        other_labels = (labels - labels_here).clamp(min=0)
+        labels_here = labels_here * (other_labels.sum(dim=1, keepdim=True) > LEAST_PIXELS)
+        opposed = (labels_here * (other_labels.flip(1) > other_labels)).sum()
+        share = float(opposed / labels_here.sum().clamp(min=1e-6))
         if share > limits.contradicted:
-            views_contradicted[view.name] = share
-    return dict(sorted(views_contradicted.items(), key=lambda item: -item[1]))
+            opposed_shares[view.name] = share
+    return dict(sorted(opposed_shares.items(), key=lambda item: -item[1]))
 
 
-def _labels_in(gaussians: Parameters, view: View, rasterize: Rasterize) -> Tensor:
-    assert view.materials is not None
-    kinds = view.materials.to(gaussians["means"].device)
-    return _labeled(gaussians, view, [(kinds == 1) | (kinds > 2), kinds == 2], rasterize)
+def _labels_in(gaussians: Parameters, view: View, kinds: Tensor, rasterize: Rasterize) -> Tensor:
+    """Return the weight [N, 2] of the pixels that the user labels as dielectric and as metal in a view."""
+    return _labeled(gaussians, view, kinds, [(kinds == 1) | (kinds > 2), kinds == 2], rasterize)
 
 
-def _labeled(gaussians: Parameters, view: View, kinds: Sequence[Tensor], rasterize: Rasterize) -> Tensor:
-    """Pixels [N, K] of kinds [H, W] bool in a view, where labels cover at least half of what it shows of a Gaussian.
+def _labeled(
+    gaussians: Parameters, view: View, kinds: Tensor, masks: Sequence[Tensor], rasterize: Rasterize
+) -> Tensor:
+    """Return the pixels [N, K] of masks [H, W] in a view; 0 for Gaussians with few labeled pixels.
 
-    At the outline of what is labeled, what lies behind and beside it is in the same pixels.
+    At least half of the pixels have to be labeled, because pixels at the outline of a label also contain Gaussians
+    behind it and next to it.
     """
-    assert view.materials is not None
-    named = view.materials.to(gaussians["means"].device) > 0
-    target = torch.stack((named, torch.ones_like(named), *kinds), dim=-1).float()
+    named = kinds > 0
+    target = torch.stack((named, torch.ones_like(named), *masks), dim=-1).float()
+    target = target.to(gaussians["means"].device)
     parts = [part.contiguous() for part in target.split(MAX_CHANNELS, dim=-1)]
     sums = torch.cat([shares(gaussians, view.camera, part, rasterize) for part in parts], dim=1)
     return sums[:, 2:] * (sums[:, 0] >= 0.5 * sums[:, 1])[:, None]
 
 
-# Pixels of a Gaussian in all views from which on what they say counts.
 LEAST_SEEN = 0.05
+"""Pixels of a Gaussian in all views above which their refractive indices count."""
 
 
 @torch.no_grad()
@@ -186,34 +202,37 @@ def index_offsets(
     rasterize: Rasterize,
     memory: MemoryBound = UNBOUNDED,
 ) -> Tensor:
-    """Offset of each Gaussian from the run's refractive index, [N].
+    """Return the offset [N] of each Gaussian from the refractive index of the run.
 
-    It is that of the material that most of its pixels in all views have; 0 where these say another one than the table
-    lists, or nothing, and of metals.
+    The offset belongs to the material of most of its pixels in all views. It is 0 for metals, and for pixels without a
+    material or with one that the table lacks.
 
     Args:
-        indices: by the number in ``View.materials``. refractive_index: refractive index of the run.
+        gaussians: the Gaussians.
+        views: all views.
+        indices: refractive indices by the number in ``View.materials``.
+        refractive_index: refractive index of the run.
+        rasterize: rasterizer of the backend.
+        memory: returns freed memory to the system.
     """
     means = gaussians["means"].detach()
     labels = {view.name: numbers_in(view) for view in views}
     numbers = sorted(set().union(*labels.values()) & indices.keys())
     weights = means.new_zeros(len(means), 1 + len(numbers))
-    for view in memory.between(labeled_views(views)):
-        assert view.materials is not None
-        kinds = view.materials.to(means.device)
-        here = [number for number in numbers if number in labels[view.name]]
-        columns = [0, *(1 + numbers.index(number) for number in here)]
-        masks = [(kinds == 1) | (kinds == 2), *(kinds == number for number in here)]
-        weights[:, columns] += _labeled(gaussians, view, masks, rasterize)
+    for view, kinds in memory.between(labeled_views(views)):
+        local_numbers = [number for number in numbers if number in labels[view.name]]
+        columns = [0, *(1 + numbers.index(number) for number in local_numbers)]
+        masks = [(kinds == 1) | (kinds == 2), *(kinds == number for number in local_numbers)]
+        weights[:, columns] += _labeled(gaussians, view, kinds, masks, rasterize)
     offsets = means.new_tensor([0.0, *(indices[number] - refractive_index for number in numbers)])
-    most, chosen = weights.max(dim=1)
-    specified = torch.where(most > LEAST_SEEN, offsets[chosen], torch.zeros_like(most))
+    largest, chosen = weights.max(dim=1)
+    specified = torch.where(largest > LEAST_SEEN, offsets[chosen], torch.zeros_like(largest))
     metalness = gaussians.get("metalness")
     return specified if metalness is None else specified * (metalness < 1)
 
 
 def numbers_in(view: View) -> set[int]:
-    """Numbers of the dielectrics with indices of their own that a view says it shows."""
+    """Return the numbers of the labeled dielectrics of a view that may have their own refractive indices."""
     return set() if view.materials is None else set(view.materials.unique().tolist()) - {0, 1, 2}
 
 
@@ -221,7 +240,7 @@ def numbers_in(view: View) -> set[int]:
 def index_picture(
     gaussians: Parameters, camera: Camera, rasterize: Rasterize, refractive_index: float
 ) -> Tensor | None:
-    """Refractive indices [H, W] as blended; None where all Gaussians have the run's."""
+    """Return the blended refractive indices [H, W]; None if all Gaussians have that of the run."""
     offsets = gaussians.get("index_offset")
     if offsets is None or not any_nonzero(gaussians, "index_offset"):
         return None

@@ -1,14 +1,32 @@
-"""The search for metals in a training: when it looks, what it changes, and what it tells the user.
+"""Search for metals in a training: its steps, its decision, and its messages.
 
-Which Gaussians are metals: the minimum of one energy over the whole scene, by a minimum cut.
+The decision is the minimum of one energy over the whole scene, found by a minimum cut. With x = 1 for a metal, E(x) is
+the sum over all Gaussians of ``-u x`` and over all pairs of neighbors of ``likeness w |x_i - x_j|``. The evidence u is
+that of the views minus the prior, in nats, and infinite for Gaussians that the user labels. Each connected piece of
+metal has an additional fixed cost.
 
-With x = 1 for a metal, E(x) is the sum over all Gaussians of ``-u x`` and over all pairs of neighbors of
-``likeness w |x_i - x_j|``. The evidence u is that of the views (``training.metals.evidence``) less the prior, in nats,
-and infinite where the user says what a Gaussian is. Each piece of metal that hangs together costs a fixed amount more.
+The evidence is the log likelihood ratio of metal and dielectric for each Gaussian. At a Gaussian, a view measures S0
+and, per color, the polarization P across the rendered normal's plane of incidence and U at 45 degrees to it. ``rho``
+are Fresnel's degrees of polarization.
+
+- The body light d of a dielectric is the same from everywhere, and its specular light s is free: ``S0 = d + s``,
+  ``P = k rho_s s - rho_d d``. Roughness leaves the share k of the polarization, from ``ROUGH`` to 1.
+- A metal mirrors free light and polarizes it according to its reflectance r: ``P = rho(r) S0``. Its color is that of
+  the mirrored light times r, so that r follows the observed color.
+
+Unpolarized light has no U. Polarized light changes P about as much as U. A metal preserves at most the share
+``conductor_oblique_share`` of U (aluminum 0.98 at 45 degrees and 0.91 at 60; copper and gold 0.57 at 60 and 0.1 at 70).
+A dielectric preserves at most ``sqrt(Rs Rp)`` times the light of the scene. Each hypothesis reduces its error
+in P by the part of U that it explains, and the rest of U is an error.
+
+The errors E are mean squares relative to the light, in n views of unknown variance. With e the typical error of the
+scene, a lower bound of all errors, they give the log likelihood ratio
+``n log((e^2 + E_dielectric) / (e^2 + E_metal))``: n/2 for each of P and U.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
@@ -22,6 +40,7 @@ from scipy.sparse.csgraph import breadth_first_order, connected_components, maxi
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from polarguide import optics
 from polarguide.capture import View
 from polarguide.capture.view import listed
 from polarguide.core.system import UNBOUNDED, MemoryBound
@@ -29,28 +48,202 @@ from polarguide.gaussians.gaussians import Gaussians
 from polarguide.gaussians.geometry import shortest_axis_normals
 from polarguide.gaussians.initialize import far_away
 from polarguide.geometry.vectors import dot
+from polarguide.optics.fresnel import reflectances_from_cosine
 from polarguide.raster import Rasterize
 from polarguide.shading.gbuffer import render
-from polarguide.shading.metal import become_metal
+from polarguide.shading.metal import FIRST_REFLECTANCE, become_metal
 from polarguide.shading.model import Light, Parameters, ShadingModel
 from polarguide.training.context import TrainingContext
-from polarguide.training.metals.evidence import MetalEvidence, evidence
-from polarguide.training.metals.observations import LEAST_PIXELS, contradicted, evenly, numbers_in
+from polarguide.training.metals.observations import (
+    LEAST_PIXELS,
+    ViewSamples,
+    contradicted,
+    evenly,
+    label_weights,
+    numbers_in,
+    samples_of,
+    view_sums,
+)
 from polarguide.training.recipe import MetalRules, MetalViews, Recipe, Schedule
 from polarguide.training.settings import ResolvedSettings
 from polarguide.training.state import TrainingState
 
-# Neighbors of a Gaussian.
+ROUGH = (1.0, 0.85, 0.7, 0.55)
+"""Shares of the specular polarization that roughness of a dielectric may leave."""
+LEVELS = (0.5, 0.6, 0.7, 0.8, 0.88, 0.95)
+"""Levels of the tested reflectances, which are a level times a power of the observed color."""
+POWERS = (0.5, 0.75, 1.0)
+"""Powers of the observed color in the tested reflectances."""
+GOLD = 0.38
+"""Smallest over largest reflectance of the most deeply colored metal, gold."""
+UNKNOWNS = 2
+"""Number of unknowns of either hypothesis, which determine the same number of views."""
+NOISE = 1e-4
+"""Lower bound of the typical error of a scene: mean square of the noise of the views, relative to the light."""
+CHUNK = 1 << 14
+"""Batch size in Gaussians, which bounds the memory of intermediate tensors."""
+
+
+class Errors(NamedTuple):
+    """Errors of both hypotheses.
+
+    Attributes:
+        dielectric, metal: [N] mean squares relative to the light.
+        reflectance: [N, 3] reflectance of the metal.
+    """
+
+    dielectric: Tensor
+    metal: Tensor
+    reflectance: Tensor
+
+
+class MetalEvidence(NamedTuple):
+    """Evidence of the views for N Gaussians.
+
+    Attributes:
+        ratio: [N] log likelihood ratio of metal and dielectric, per view.
+        views: [N] number of independent views.
+        reflectance: [N, 3] reflectance of the best metal.
+        color: [N, 3] mean S0.
+        labels: [N, 2] weight of pixels that the user labels as dielectric and as metal.
+    """
+
+    ratio: Tensor
+    views: Tensor
+    reflectance: Tensor
+    color: Tensor
+    labels: Tensor
+
+
+def errors(samples: ViewSamples, refractive_index: float, light: float, dark: float) -> Errors:
+    """Return the errors of both hypotheses for N Gaussians.
+
+    Args:
+        samples: means over the views.
+        refractive_index: refractive index of dielectrics.
+        light: mean radiance of the scene, S0.
+        dark: radiance added to the reference of relative errors.
+    """
+    s0 = samples.s0
+    across = samples.across
+    cosine = samples.cosine[..., None]
+    sine2 = 1 - cosine * cosine
+    above = s0.clamp(min=0) + dark  # the variance of photon counts grows with the light
+    weight = samples.weight[..., None] / above
+    scale = (weight * above * above).sum(dim=0).clamp(min=1e-9)
+
+    def mean(square: Tensor) -> Tensor:
+        return ((weight * square).sum(dim=0) / scale).mean(dim=1)
+
+    specular, diffuse = (slope * sine2 for slope in optics.dolp_slopes(cosine, refractive_index))
+    bodies = []
+    for left in ROUGH:
+        over = left * specular
+        by_line = weight / (1 + over * over)
+        of_body = over + diffuse
+        excess = over * s0 - across
+        body = (by_line * of_body * excess).sum(dim=0) / (by_line * of_body**2).sum(dim=0).clamp(min=1e-9)
+        bodies.append(mean((excess - of_body * body.clamp(min=0)) ** 2 / (1 + over * over)))
+    color = (samples.weight[..., None] * s0).sum(dim=0)
+    color = (color / color.amax(dim=1, keepdim=True).clamp(min=1e-6)).clamp(min=0.05)
+    oblique = mean(samples.oblique**2)
+
+    def excused(error: Tensor, largest: Tensor) -> Tensor:
+        """Subtract the part of an error that an oblique polarization up to ``largest`` explains, and add the excess."""
+        beyond = mean((samples.oblique.abs() - largest).clamp(min=0) ** 2)
+        return (error - (oblique - beyond).clamp(min=0)).clamp(min=0) + beyond
+
+    metals = []
+    tried = [level * color**power for power in POWERS for level in LEVELS]
+    for reflectance in tried:
+        n, k = optics.conductor_index(reflectance)
+        degree = optics.conductor_dolp_slope(cosine, n, k) * sine2
+        error = mean((across - degree * s0) ** 2 / (1 + degree * degree))
+        metals.append(excused(error, optics.conductor_oblique_share(cosine, n, k).abs() * s0.clamp(min=0)))
+    metal, chosen = torch.stack(metals).min(dim=0)
+    s, p = reflectances_from_cosine(cosine, refractive_index)
+    dielectric = excused(torch.stack(bodies).amin(dim=0), (s * p).sqrt() * light)
+    best = torch.stack(tried)[chosen, torch.arange(len(chosen), device=chosen.device)]
+    return Errors(dielectric, metal, best)
+
+
+@torch.no_grad()
+def evidence(
+    gaussians: Parameters,
+    views: Sequence[View],
+    rasterize: Rasterize,
+    refractive_index: float,
+    rules: MetalRules,
+    limits: MetalViews,
+    memory: MemoryBound = UNBOUNDED,
+) -> MetalEvidence:
+    """Return the evidence of the views for each Gaussian; see the module's text.
+
+    Views whose pictures do not determine the Stokes vector only contribute the labels of the user.
+    """
+    labels = label_weights(gaussians, views, rasterize, memory)
+    measured = evenly([view for view in views if view.is_determined], limits.most_views)
+    if not measured:
+        none = labels.new_zeros(len(labels))
+        gray = labels.new_full((len(labels), 3), FIRST_REFLECTANCE)
+        return MetalEvidence(none, none, gray, torch.zeros_like(gray), labels)
+    looks = view_sums(gaussians, memory.between(measured), rasterize, limits)
+    result = of_views(looks, labels, refractive_index, rules, limits)
+    del looks
+    memory.clear()
+    return result
+
+
+def of_views(
+    looks: Sequence[Tensor], labels: Tensor, refractive_index: float, rules: MetalRules, limits: MetalViews
+) -> MetalEvidence:
+    """Return the evidence of the sums of ``view_sums`` and of the labels of the user."""
+    sums = torch.stack([look.sum(dim=0) for look in looks]).sum(dim=0)
+    light = float(sums[1:4].mean() / sums[0].clamp(min=1e-6))
+    parts = []
+    for begin in range(0, len(labels), CHUNK):
+        samples = samples_of(looks, slice(begin, begin + CHUNK), limits)
+        total = samples.weight.sum(dim=0)
+        count = total * total / (samples.weight**2).sum(dim=0).clamp(min=1e-9) * (total > LEAST_PIXELS)
+        color = (samples.weight[..., None] * samples.s0).sum(dim=0) / total.clamp(min=1e-6)[:, None]
+        parts.append((*errors(samples, refractive_index, light, limits.dark), count, color, total))
+    dielectric, metal, reflectance, count, color, total = (
+        torch.cat(values) for values in zip(*parts, strict=True)
+    )
+    typical = torch.minimum(dielectric, metal)[count > UNKNOWNS]
+    error = typical.median().clamp(min=NOISE) if len(typical) else dielectric.new_tensor(1.0)
+    ratio = ((error + dielectric) / (error + metal)).log() - _tint_cost(color, total, rules)
+    return MetalEvidence(ratio, (count - UNKNOWNS).clamp(min=0), reflectance, color.clamp(min=0), labels)
+
+
+def _tint_cost(color: Tensor, weight: Tensor, rules: MetalRules) -> Tensor:
+    """Return the cost [N] of a metal that is more deeply colored than gold in the mean light of the scene.
+
+    The unit is nats per view.
+    """
+    mean = (color * weight[:, None]).sum(dim=0) / weight.sum().clamp(min=1e-6)
+    tints = (color / mean.clamp(min=1e-6)).clamp(min=1e-3)
+    tint = (tints.amin(dim=1) / tints.amax(dim=1)).log()
+    return 0.5 * ((math.log(GOLD) - tint).clamp(min=0) / rules.tint) ** 2
+
+
 NEIGHBORS = 16
-# Capacities of the flow are integers: so many to a nat. INFINITE, in nats, is more than all that others can weigh.
+"""Number of neighbors of a Gaussian."""
 PER_NAT = 100
+"""Capacity of one nat in the flow, whose capacities are integers."""
 INFINITE = 1e5
-# Radiance (full scale is 1) that is added to colors before they are compared.
+"""Evidence of a label, in nats, which exceeds all other evidence."""
 DARK = 0.02
+"""Radiance (full scale is 1) that is added to colors before their comparison."""
 
 
 class Graph(NamedTuple):
-    """Pairs of neighbors: both [M], and what it costs, in nats, to be of different kinds [M]."""
+    """Pairs of neighbors.
+
+    Attributes:
+        first, second: [M] indices of both Gaussians.
+        cost: [M] cost of different materials, in nats.
+    """
 
     first: NDArray[np.int64]
     second: NDArray[np.int64]
@@ -58,9 +251,9 @@ class Graph(NamedTuple):
 
 
 def neighbor_graph(gaussians: Parameters, measured: MetalEvidence, rules: MetalRules) -> Graph:
-    """The nearest neighbors of each Gaussian, tied by how alike they are turned and how alike their color is.
+    """Return the nearest neighbors of each Gaussian, connected by the similarity of their normals and colors.
 
-    The scene tells which colors are alike: the mean square of what neighbors differ by is 1.
+    Color differences are relative to the root mean square difference of neighbors in the scene.
     """
     means = gaussians["means"].detach()
     axes = shortest_axis_normals(
@@ -68,34 +261,36 @@ def neighbor_graph(gaussians: Parameters, measured: MetalEvidence, rules: MetalR
     )
     places = means.cpu().double().numpy()
     count = min(NEIGHBORS + 1, len(places))
-    near = torch.from_numpy(cKDTree(places).query(places, k=count)[1]).reshape(len(places), count)[:, 1:]
-    near = near.to(means.device)
+    neighbors = torch.from_numpy(cKDTree(places).query(places, k=count)[1]).reshape(len(places), count)[:, 1:]
+    neighbors = neighbors.to(means.device)
     logarithms = (measured.color + DARK).log()
-    apart = (logarithms[near] - logarithms[:, None]).square().mean(dim=-1)
-    seen = measured.views > 0
-    typical = (apart.mean(dim=1) * seen).sum() / seen.sum().clamp(min=1)
-    alike = dot(axes[:, None], axes[near]) ** 4 * torch.exp(-0.5 * apart / typical.clamp(min=1e-6))
+    differences = (logarithms[neighbors] - logarithms[:, None]).square().mean(dim=-1)
+    visible = measured.views > 0
+    typical = (differences.mean(dim=1) * visible).sum() / visible.sum().clamp(min=1)
+    alike = dot(axes[:, None], axes[neighbors]) ** 4 * torch.exp(-0.5 * differences / typical.clamp(min=1e-6))
     first = np.repeat(np.arange(len(places)), count - 1)
-    # A pair that is near from both sides is there twice.
+    # A pair of mutual neighbors appears twice.
     return Graph(
-        first, near.cpu().numpy().ravel(), (0.5 * rules.likeness * alike).cpu().double().numpy().ravel()
+        first, neighbors.cpu().numpy().ravel(), (0.5 * rules.likeness * alike).cpu().double().numpy().ravel()
     )
 
 
 def unary(measured: MetalEvidence, allowed: Tensor, rules: MetalRules) -> Tensor:
-    """What metal is better than dielectric for each Gaussian by itself, in nats [N].
+    """Return the evidence [N] for metal of each Gaussian alone, in nats.
 
     Args:
-        allowed: [N] bool, those that may be metals unless the user says so.
+        measured: evidence of the views.
+        allowed: [N] bool, Gaussians that may be metals without a label.
+        rules: constants of the energy.
     """
     nats = measured.views * measured.ratio - (measured.views + 1) * rules.prior
     nats = torch.where(allowed, nats.clamp(-rules.trust, rules.trust), torch.full_like(nats, -INFINITE))
-    words = (measured.labels[:, 1] > measured.labels[:, 0]).to(nats) * 2 - 1
-    return torch.where(measured.labels.sum(dim=1) > LEAST_PIXELS, words * INFINITE, nats)
+    signs = (measured.labels[:, 1] > measured.labels[:, 0]).to(nats) * 2 - 1
+    return torch.where(measured.labels.sum(dim=1) > LEAST_PIXELS, signs * INFINITE, nats)
 
 
 def minimum_cut(nats: NDArray[np.float64], graph: Graph) -> NDArray[np.bool_]:
-    """The x [N] of least energy; of several the one with the fewest metals."""
+    """Return the x [N] of least energy; in a tie, the one with the fewest metals."""
     count = len(nats)
     every = np.arange(count)
     source = np.full(count, count)
@@ -116,7 +311,7 @@ def minimum_cut(nats: NDArray[np.float64], graph: Graph) -> NDArray[np.bool_]:
 def surfaces(
     metal: NDArray[np.bool_], nats: NDArray[np.float64], graph: Graph, least: float
 ) -> NDArray[np.bool_]:
-    """Those of the metals whose pieces lower the energy by more than a piece costs."""
+    """Return the metals in pieces that lower the energy by more than the cost of a piece."""
     count = len(metal)
     first, second, cost = graph
     inside = metal[first] & metal[second] & (cost > 0.5 / PER_NAT)
@@ -136,12 +331,15 @@ def decide(
     rules: MetalRules,
     priors: Sequence[float] = (1.0,),
 ) -> Tensor:
-    """Metalness [N] of the Gaussians, the mean over several priors of the minimum of the energy; see the module's text.
+    """Return the metalness [N]: the mean of the minimum of the energy over several priors.
 
     Args:
-        allowed: [N] bool, those that may be metals unless the user says so.
-        priors: shares of the prior. With one, a Gaussian is a metal (1) or a dielectric (0); with more it is between
-            them where the priors decide differently.
+        measured: evidence of the views.
+        gaussians: the Gaussians.
+        allowed: [N] bool, Gaussians that may be metals without a label.
+        rules: constants of the energy.
+        priors: shares of the prior. With one share, a Gaussian is a metal (1) or a dielectric (0). With more, metalness
+            is between them where the priors lead to different decisions.
     """
     graph = neighbor_graph(gaussians, measured, rules)
     metalness = np.zeros(len(allowed), dtype=np.float32)
@@ -151,8 +349,8 @@ def decide(
     return torch.from_numpy(metalness / len(priors)).to(allowed.device)
 
 
-# Shares of the prior that decide before the last look; metalness is the share of these decisions that say metal.
 SOFT_PRIORS = (1 / 3, 2 / 3, 1.0)
+"""Shares of the prior before the last search; metalness is the share of these decisions for metal."""
 
 
 @torch.no_grad()
@@ -165,13 +363,14 @@ def light_gain(
     limits: MetalViews,
     memory: MemoryBound = UNBOUNDED,
 ) -> float:
-    """By how much the light should be brighter, as the first metals show it.
+    """Return the factor by which the light should be brighter, according to the first metals.
 
-    Dielectrics fix the product of strength and light alone. Metals, whose reflectance is known, fix the light.
+    Dielectrics determine only the product of strength and light. Metals, whose reflectance is known, determine the
+    light.
 
     Returns:
-        The median of what they show over what is rendered of them; 1 without views and where they are hardly seen. Not
-        so little that strengths would have to exceed 1.
+        The median of measured over rendered light of metals, at most ``most_gain`` and at least a value that keeps
+        strengths below 1. 1 without views, and for too few metal pixels.
     """
     ratios = []
     pixels = 0
@@ -190,14 +389,14 @@ def light_gain(
     if not len(ratio) or len(ratio) < limits.gain_pixels * pixels:
         return 1.0
     body = gaussians["metalness"] == 0
-    least = (
+    smallest = (
         torch.quantile(shading.strength(gaussians)[body], 0.9) if bool(body.any()) else ratio.new_tensor(0.1)
     )
-    return float(ratio.median().exp().clamp(min=float(least), max=limits.most_gain))
+    return float(ratio.median().exp().clamp(min=float(smallest), max=limits.most_gain))
 
 
 class MetalSearch:
-    """Finds metals at the refreshes of the priors, within the share of the steps that the recipe specifies.
+    """Search for metals at the refreshes of the priors, within the share of the steps that the recipe specifies.
 
     Args:
         context: context of the training.
@@ -209,14 +408,14 @@ class MetalSearch:
         self._looks = looks(context.recipe, context.settings)
 
     def is_due(self, step: int) -> bool:
-        """Whether a refresh at this step looks for metals."""
+        """Return True if a refresh at this step searches for metals."""
         context = self._context
         steps = context.settings.steps
         return _searches(context.recipe, context.settings) and _within(context.recipe.metals, step, steps)
 
     @torch.no_grad()
     def look(self, state: TrainingState) -> None:
-        """Decide which Gaussians are metals, and begin with what was measured of those that are new."""
+        """Decide which Gaussians are metals, and initialize new metals with the measurement."""
         context = self._context
         views = context.views
         if not any(view.is_determined or view.materials is not None for view in views):
@@ -253,15 +452,15 @@ class MetalSearch:
         self._warned = True
         names = listed([f"materials/{name}.png" for name in wrong])
         context.reporter.warn(
-            f"other views contradict {names} on {100 * max(wrong.values()):.0f} % of what is said there, at most: "
-            "dielectric in one view, metal in another. The larger part counts; look at these files."
+            f"other views contradict {names} on up to {100 * max(wrong.values()):.0f} % of their labels: dielectric "
+            "in one view, metal in another. The majority counts; check these files."
         )
 
     @torch.no_grad()
     def undecided(self, state: TrainingState) -> Tensor | None:
-        """Gaussians [N] bool that are dielectrics by the prior alone: what was measured of them would make them metals.
+        """Return a mask [N] of Gaussians that are dielectrics by the prior alone, and metals by their measurement.
 
-        None where a training does not look for metals, or no view determines the Stokes vector.
+        None if the training does not search for metals, or if no view determines the Stokes vector.
         """
         if not self._looks or not any(view.is_determined for view in self._context.views):
             return None
@@ -283,32 +482,33 @@ class MetalSearch:
         )
 
     def _allowed(self, state: TrainingState) -> Tensor:
-        """Gaussians [N] bool that may be metals unless the user says so: none where nothing tells how far a label
-        reaches.
+        """Return a mask [N] of Gaussians that may be metals without a label.
+
+        It is empty without polarization, because the range of a label is then unknown.
         """
         context = self._context
         means = state.gaussians["means"].detach()
         reach = context.recipe.metal_views.reach
-        far = far_away(means.cpu(), context.scene.points, context.centers, reach).to(means.device)
-        return ~far & any(view.is_determined for view in context.views)
+        is_far = far_away(means.cpu(), context.scene.points, context.centers, reach).to(means.device)
+        return ~is_far & any(view.is_determined for view in context.views)
 
     def _priors(self, step: int) -> tuple[float, ...]:
-        """Shares of the prior that decide at a step: several before the last look, so that metalness is soft first.
+        """Return the shares of the prior at a step: several before the last search, for soft metalness.
 
-        Normals of a metal that is shaded as a dielectric are wrong, and its evidence with them. What is likely is
-        therefore shaded as a mixture first, and is a dielectric again where its own normals do not confirm it.
+        A metal that is shaded as a dielectric has wrong normals and wrong evidence. A likely metal is therefore shaded
+        as a mixture first, and becomes a dielectric again if its new normals do not confirm the metal.
         """
         return SOFT_PRIORS if step < max(self._looks, default=step) else (1.0,)
 
 
 def refreshes(recipe: Recipe, steps: int) -> list[int]:
-    """The steps of a training that refresh its priors."""
+    """Return the steps of a training that refresh its priors."""
     schedule = Schedule(recipe, steps)
     return [step for step in range(steps) if "refresh_priors" in schedule.at(step).actions]
 
 
 def looks(recipe: Recipe, settings: ResolvedSettings) -> list[int]:
-    """The steps at which a training decides what is metal; none: it takes everything for dielectric."""
+    """Return the steps at which a training decides on metals; empty if all surfaces are dielectrics."""
     if not _searches(recipe, settings):
         return []
     steps = settings.steps
@@ -318,7 +518,7 @@ def looks(recipe: Recipe, settings: ResolvedSettings) -> list[int]:
 def warn_of_unused_materials(context: TrainingContext) -> None:
     """Warn if ``materials/``, or refractive indices of single materials, have no effect on a training.
 
-    Recipes that never refresh their priors, such as controls, do not look for metals and get no warning of these.
+    Recipes that never refresh their priors, such as controls, do not search for metals and get no warning of these.
     """
     recipe = context.recipe
     settings = context.settings
@@ -329,15 +529,15 @@ def warn_of_unused_materials(context: TrainingContext) -> None:
         first, last = (100 * share for share in recipe.metals)
         context.reporter.warn(
             f"materials/ is read at refreshes of the priors between {first:.0f} and {last:.0f} % of the steps. "
-            "A training this short has none there, and takes everything for dielectric. Take more steps."
+            "This training is too short for such a refresh and treats all surfaces as dielectrics. Use more steps."
         )
     indices = context.scene.indices
     if not indices:
         return
     if not ("index_offset" in recipe.shading.parameters and refreshed):
-        why = f"the recipe {recipe.name} takes the run's for everything"
+        why = f"the recipe {recipe.name} uses that of the run for all surfaces"
     elif not any(numbers_in(view) & indices.keys() for view in views):
-        why = "no picture in materials/ of a training view has one of their numbers"
+        why = "no picture in materials/ of a training view contains their numbers"
     else:
         return
     context.reporter.warn(
@@ -354,5 +554,5 @@ def _within(shares: tuple[float, float], step: int, steps: int) -> bool:
 
 
 def _names_metals(view: View) -> bool:
-    """Whether the user says of a view which of what it shows is a metal, or none."""
+    """Return True if the user labels metals or dielectrics in a view."""
     return view.materials is not None and bool(((view.materials == 1) | (view.materials == 2)).any())
