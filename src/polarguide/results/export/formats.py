@@ -289,7 +289,10 @@ class _Exporter:
 
     def spz(self) -> list[Path]:
         """Write SPZ in units of the scene, because the format rounds positions to 1/4096 of a unit."""
-        placement = replace(self.presented.placement, scale=1.0, metric=False)
+        # Readers expect +y up and revert this half turn.
+        half_turn = torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))
+        rotation = half_turn @ self.presented.placement.rotation
+        placement = replace(self.presented.placement, rotation=rotation, scale=1.0, metric=False)
         return self._from_ply("splats.spz", partial(write_spz, version=self.spz_version), placement)
 
     def sog(self) -> list[Path]:

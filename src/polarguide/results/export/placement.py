@@ -28,9 +28,6 @@ from polarguide.geometry.camera import Camera
 from polarguide.geometry.scene_frame import SceneFrame
 from polarguide.geometry.vectors import spread_directions
 
-HARMONICS = ("f_rest", "linear_rest")
-"""Fields of harmonics in our PLY files. The first is channel-major, the second has the channel last."""
-
 
 @dataclass(frozen=True, eq=False)
 class Placement:
@@ -65,9 +62,14 @@ class Placement:
         return cls(rotation, scale or 1.0, scale is not None, around is not None)
 
     @property
+    def rotates(self) -> bool:
+        """True if the axes of the file differ from the scene's."""
+        return not torch.equal(self.rotation, torch.eye(3, dtype=torch.float64))
+
+    @property
     def changes(self) -> bool:
         """True if the placement is not the identity."""
-        return self.upright or self.scale != 1.0
+        return self.rotates or self.scale != 1.0
 
     def points(self, places: Tensor) -> Tensor:
         """Convert points [N, 3] of the scene to the file."""
@@ -97,31 +99,24 @@ class Placement:
         """Transform the Gaussians of a PLY, a structured array in the layout of ``write_ply``, in place."""
         if not self.changes:
             return
-        for fields, scale in ((("x", "y", "z"), self.scale), (("nx", "ny", "nz"), 1.0)):
-            values = np.stack([table[name] for name in fields], axis=1).astype(np.float64)
-            for name, column in zip(fields, (scale * values @ self.rotation.numpy().T).T, strict=True):
-                table[name] = column
+        rotation = self.rotation.numpy()
+        _transform(table, ["x", "y", "z"], self.scale * rotation)
+        _transform(table, ["nx", "ny", "nz"], rotation)
         for k in range(3):
             table[f"scale_{k}"] += math.log(self.scale)
-        if not self.upright:
+        if not self.rotates:
             return
-        quaternions = np.stack([table[f"rot_{k}"] for k in (1, 2, 3, 0)], axis=1).astype(np.float64)
-        rotated = Rotation.from_matrix(self.rotation.numpy()) * Rotation.from_quat(quaternions)
-        for k, column in enumerate(rotated.as_quat().T[[3, 0, 1, 2]]):
-            table[f"rot_{k}"] = column
+        names = [f"rot_{k}" for k in (1, 2, 3, 0)]
+        quaternions = np.stack([table[name] for name in names], axis=1).astype(np.float64)
+        rotated = Rotation.from_matrix(rotation) * Rotation.from_quat(quaternions)
+        for name, column in zip(names, rotated.as_quat().T, strict=True):
+            table[name] = column
         matrix = self.harmonics()
-        names = table.dtype.names or ()
-        for field in HARMONICS:
-            if f"{field}_{3 * REST_COUNT - 1}" not in names:
-                continue
-            for channel in range(3):
-                places = [
-                    f"{field}_{channel * REST_COUNT + k if field == 'f_rest' else 3 * k + channel}"
-                    for k in range(REST_COUNT)
-                ]
-                values = np.stack([table[name] for name in places]).astype(np.float64)
-                for name, column in zip(places, matrix @ values, strict=True):
-                    table[name] = column
+        for channel in range(3):
+            # f_rest is channel-major; linear_rest has the channel last.
+            _transform(table, [f"f_rest_{channel * REST_COUNT + k}" for k in range(REST_COUNT)], matrix)
+            if "linear_rest_0" in table.dtype.fields:
+                _transform(table, [f"linear_rest_{3 * k + channel}" for k in range(REST_COUNT)], matrix)
 
     def record(self) -> dict[str, Any]:
         """Return the record in exported files: ``units``, ``up_axis``, rotation and scale of the scene."""
@@ -131,6 +126,13 @@ class Placement:
             **({"meters_per_unit_of_scene": self.scale} if self.metric else {}),
             **({"rotation_of_scene": self.rotation.flatten().tolist()} if self.upright else {}),
         }
+
+
+def _transform(table: NDArray[Any], names: Sequence[str], matrix: NDArray[np.float64]) -> None:
+    """Multiply the vectors in some fields of a structured array by a matrix, in place."""
+    values = np.stack([table[name] for name in names]).astype(np.float64)
+    for name, column in zip(names, matrix @ values, strict=True):
+        table[name] = column
 
 
 @dataclass(frozen=True)
