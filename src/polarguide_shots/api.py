@@ -14,8 +14,7 @@ from polarguide.core.errors import PolarguideError
 from polarguide.core.files import read_file
 from polarguide.core.options import PathLike, SceneOptions, index_of
 from polarguide.core.progress import SILENT, Reporter
-from polarguide.results.rendering.pictures import views_named
-from polarguide.results.rendering.priors import write_priors
+from polarguide.results.rendering.pictures import views_named, write_priors
 from polarguide.runs.opened import OpenedRun, read_scene
 from polarguide_shots.calibration.calibrate import calibrate_sensor
 from polarguide_shots.measurement.line import measure_shots

@@ -50,13 +50,13 @@ from polarguide.results.export.placement import (
     SUFFIX,
     Origin,
     Placement,
+    Presented,
     comments,
     rewrite_splats,
     transforms,
     write_colmap,
     write_transforms,
 )
-from polarguide.results.export.presented import Presented
 from polarguide.results.export.splats import COLOR_SPACES, Encoding, write_sog, write_splat_glb, write_spz
 from polarguide.results.export.usd import write_splat_usdz, write_usdz
 from polarguide.results.rendering.mesh import RESOLUTION, scene_mesh

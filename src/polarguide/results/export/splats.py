@@ -29,7 +29,7 @@ from torch import Tensor
 from polarguide.core.errors import PolarguideError, optional_import
 from polarguide.core.files import atomic, write_whole
 from polarguide.gaussians.ply import read_ply
-from polarguide.results.export.glb import Binary
+from polarguide.results.export.model.gltf import Binary
 from polarguide.results.export.web_page import curve_places
 
 
