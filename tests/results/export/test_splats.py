@@ -31,7 +31,6 @@ from polarguide.results.export.placement import (
     Placement,
     comments,
     rewrite_splats,
-    with_comments,
 )
 from polarguide.results.export.splats import write_sog, write_spz
 from polarguide.runs.model import gaussian_colors, write_run_ply
@@ -325,13 +324,3 @@ def test_only_what_is_kept_is_written_and_the_third_line_stays(tmp_path: Path) -
     assert lines[2] == "element vertex 2"
     assert {"comment author Renee (c)", "comment license CC0", "comment source \\u5317\\u4eac"} <= set(lines)
     assert "comment units units of the scene" in lines
-
-
-def test_comments_are_put_into_a_ply_of_others(tmp_path: Path) -> None:
-    trimesh = pytest.importorskip("trimesh")
-    mesh = trimesh.creation.box()
-    data = with_comments(mesh.export(file_type="ply"), ["author A", "units meters"])
-    (tmp_path / "box.ply").write_bytes(data)
-    read = PlyData.read(tmp_path / "box.ply")
-    assert {"author A", "units meters"} <= {*read.comments, *read["vertex"].comments}
-    assert len(trimesh.load(tmp_path / "box.ply").faces) == 12

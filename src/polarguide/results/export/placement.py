@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import re
 import unicodedata
 import warnings
 from collections.abc import Callable, Mapping, Sequence
@@ -185,14 +184,6 @@ def _ascii(value: Any) -> str:
     decomposed = unicodedata.normalize("NFKD", text.replace("©", "(c)"))
     plain = "".join(character for character in decomposed if not unicodedata.combining(character))
     return plain.encode("ascii", "backslashreplace").decode()
-
-
-def with_comments(ply: bytes, lines: list[str]) -> bytes:
-    """Insert comments into a PLY file after the line of its first element, which SIBR expects as third line."""
-    match = re.search(rb"^element [^\n]*\n", ply, re.MULTILINE)
-    assert match is not None
-    added = "".join(f"comment {line}\n" for line in lines).encode("ascii")
-    return ply[: match.end()] + added + ply[match.end() :]
 
 
 def rewrite_splats(path: Path, ply: Path, placement: Placement, mask: Tensor, lines: list[str]) -> None:

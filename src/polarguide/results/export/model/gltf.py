@@ -25,7 +25,7 @@ ARRAY = 34962
 """Target of a buffer view with vertex attributes."""
 ELEMENTS = 34963
 """Target of a buffer view with vertex indices."""
-_COMPONENTS = {np.dtype("<f4"): 5126, np.dtype("<u4"): 5125}
+_COMPONENTS = {np.dtype("<f4"): 5126, np.dtype("<u4"): 5125, np.dtype("u1"): 5121}
 _TYPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
 
 
@@ -46,7 +46,7 @@ class Binary:
         return len(self._views) - 1
 
     def array(self, values: NDArray[Any], target: int = ARRAY, *, bounds: bool = False) -> int:
-        """Add values [N] or [N, C], float32 or uint32, and return the index of their accessor.
+        """Add values [N] or [N, C], float32, uint32 or normalized uint8, and return the index of their accessor.
 
         Args:
             values: the array. target: target of the buffer view.
@@ -56,6 +56,7 @@ class Binary:
         accessor: dict[str, Any] = {
             "bufferView": self.view(values.tobytes(), target),
             "componentType": _COMPONENTS[values.dtype],
+            "normalized": values.dtype == np.uint8,
             "count": len(table),
             "type": _TYPES[table.shape[1]],
         }
