@@ -1,6 +1,7 @@
-"""House rules that a syntax tree shows: one assignment per line."""
+"""House rules that a syntax tree shows: one assignment per line, unique names in a package."""
 
 import ast
+from collections import defaultdict
 from pathlib import Path
 
 import pytest
@@ -56,3 +57,27 @@ def test_each_assignment_has_a_line_of_its_own():
 )
 def test_parallel_assignments_are_found(text, lines):
     assert parallel_assignments(text) == lines
+
+
+def repeated_names(package):
+    """Return the names of classes and public functions that several modules of a package define."""
+    modules = defaultdict(list)
+    for path in sorted(package.rglob("*.py")):
+        for node in ast.parse(path.read_text(encoding="utf-8")).body:
+            public = isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)) and not node.name.startswith(
+                "_"
+            )
+            if public or isinstance(node, ast.ClassDef):
+                modules[node.name].append(path.relative_to(package).as_posix())
+    return {name: paths for name, paths in modules.items() if len(paths) > 1}
+
+
+@pytest.mark.parametrize("package", sorted(path.name for path in SOURCE.iterdir() if path.is_dir()))
+def test_names_are_unique_within_a_package(package):
+    assert repeated_names(SOURCE / package) == {}
+
+
+def test_repeated_names_are_found(tmp_path):
+    (tmp_path / "a.py").write_text("class _Same: ...\ndef one(): ...\ndef _private(): ...\n")
+    (tmp_path / "b.py").write_text("class _Same: ...\ndef two(): ...\ndef _private(): ...\n")
+    assert repeated_names(tmp_path) == {"_Same": ["a.py", "b.py"]}

@@ -1,4 +1,4 @@
-"""Formulas as SVG in the page: the same everywhere, without a script, a network or a font of the reader's."""
+"""Formulas as SVG, so that pages need no script, network or font."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ ziamath.config.svg2 = False
 
 
 def drawn(node: nodes.Node, *, inline: bool) -> str:
-    """The formula in a node as SVG, in the color of the text; a warning, and its source, where it cannot be drawn."""
+    """Draw the formula of a node as SVG in the color of the text. Its source and a warning replace it on failure."""
     source = " ".join(node.astext().split())
     try:
         size = INLINE_SIZE if inline else BLOCK_SIZE

@@ -1,4 +1,4 @@
-"""Pages that are made from the program itself, so that they cannot go stale.
+"""Pages generated from the program, so that they are always current.
 
 reference/api/*.md           a page for each room of the product and for each neighbor, with all public modules
 generated/command-line.md    every verb and option, as the program's own help states them
@@ -29,7 +29,7 @@ NOT_LIBRARY = tuple(f"{PACKAGE}.{room}" for room in ("_native", "api", "cli", "_
 
 
 def rooms(docs: Path) -> tuple[str, ...]:
-    """Full names of the rooms from the top down: the tuple ROOMS of tests/test_imports.py."""
+    """Return the names of the rooms in import order, from the tuple ROOMS of tests/test_imports.py."""
     tree = ast.parse((docs.parent / "tests" / "test_imports.py").read_text(encoding="utf-8"))
     for node in tree.body:
         if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "ROOMS":
@@ -38,7 +38,7 @@ def rooms(docs: Path) -> tuple[str, ...]:
 
 
 def source_of(name: str) -> Path:
-    """The file of a module of the package, found without importing it."""
+    """Return the file of a module without importing it."""
     package = find_spec(name.partition(".")[0])
     assert package is not None
     assert package.submodule_search_locations
@@ -47,13 +47,13 @@ def source_of(name: str) -> Path:
 
 
 def exists(name: str) -> bool:
-    """Whether there is such a module or package."""
+    """Return True if the module or package exists."""
     path = source_of(name)
     return path.exists() or path.name == "__init__.py"
 
 
 def summary(name: str) -> str:
-    """First sentence of a module's docstring, without a full stop; empty where it has none."""
+    """Return the first sentence of a module's docstring without its full stop, or an empty text."""
     path = source_of(name)
     path = path if path.exists() else path.with_suffix(".pyi")  # a compiled module
     text = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) if path.exists() else None
@@ -61,7 +61,7 @@ def summary(name: str) -> str:
 
 
 def public_modules(name: str) -> Iterator[str]:
-    """A module and everything below it that is not private."""
+    """Yield a module and its public submodules."""
     yield name
     path = source_of(name)
     if path.name == "__init__.py":
@@ -71,7 +71,7 @@ def public_modules(name: str) -> Iterator[str]:
 
 
 def module_section(name: str, level: int) -> str:
-    """A heading and everything public that a module defines itself."""
+    """Return a heading and the directives for the public names that a module defines."""
     is_package = source_of(name).name == "__init__.py"
     members = "" if is_package else "\n   :members:\n   :ignore-module-all:"
     title = name if level == 1 else name.partition(".")[2]
@@ -79,13 +79,13 @@ def module_section(name: str, level: int) -> str:
 
 
 def page_of(room: str) -> str:
-    """The name of the page that documents a room: of the room at the top of the product, or of the neighbor."""
+    """Return the name of the page that documents a room: its top-level room in the product, or its package."""
     package, _, rest = room.partition(".")
     return f"{package}.{rest.partition('.')[0]}" if package == PACKAGE else package
 
 
 def api_pages(docs: Path) -> dict[str, str]:
-    """Text of the pages below reference/api by name."""
+    """Return the texts of the pages below reference/api by name."""
     pages = {}
     for name in dict.fromkeys(page_of(room) for room in rooms(docs)):
         if name in NOT_LIBRARY or not exists(name):
@@ -109,7 +109,7 @@ def api_pages(docs: Path) -> dict[str, str]:
 
 
 def escaped(text: str) -> str:
-    """Text with Markdown's own characters escaped; ``code`` becomes `code`."""
+    """Escape Markdown in a text and turn ``code`` into `code`."""
     parts = re.split(r"(``.+?``)", text)
     parts[::2] = [re.sub(r"([\\`*_{}\[\]<>|$#~])", r"\\\1", part) for part in parts[::2]]
     parts[1::2] = [part[1:-1] for part in parts[1::2]]
@@ -117,7 +117,7 @@ def escaped(text: str) -> str:
 
 
 def public_names() -> str:
-    """Every name of ``import polarguide``, described where it stands: functions, the run, then all else."""
+    """Return the page of the public names of ``polarguide``: functions, the run, and all others."""
     package = importlib.import_module(PACKAGE)
     found = {name: getattr(package, name) for name in package.__all__ if not name.startswith("_")}
     directives = []
@@ -135,7 +135,7 @@ def public_names() -> str:
 
 
 def help_of(*verb: str) -> str:
-    """What ``polarguide VERB --help`` prints, without colors and so wide that nothing is broken over lines."""
+    """Return the help text of a verb without colors and line breaks."""
     command = [sys.executable, "-m", PACKAGE, *verb, "--help"]
     environment = {**os.environ, "COLUMNS": "2000", "NO_COLOR": "1", "TERM": "dumb"}
     done = subprocess.run(command, capture_output=True, text=True, env=environment)
@@ -145,7 +145,7 @@ def help_of(*verb: str) -> str:
 
 
 def boxes(text: str) -> tuple[str, list[tuple[str, list[str]]]]:
-    """The text above the first box of a help text, and each box: its title and the lines in it."""
+    """Split a help text into the text above the first box, and the title and lines of each box."""
     above: list[str] = []
     found: list[tuple[str, list[str]]] = []
     for line in text.splitlines():
@@ -159,9 +159,9 @@ def boxes(text: str) -> tuple[str, list[tuple[str, list[str]]]]:
 
 
 def entries(lines: list[str]) -> tuple[str, list[tuple[str, str]]]:
-    """What a box is about, if it says so above a rule (one paragraph); and its options with what they do.
+    """Return the introduction of a box, which ends at a rule, and its options with their descriptions.
 
-    Names start at the left, what they do stands apart.
+    Option names start at the left edge, and descriptions are indented.
     """
     rule = next((number for number, line in enumerate(lines) if line.strip() and not line.strip("─ ")), -1)
     above = lines[: max(rule, 0)]
@@ -178,12 +178,12 @@ def entries(lines: list[str]) -> tuple[str, list[tuple[str, str]]]:
 
 
 def plain(text: str) -> str:
-    """Text with reStructuredText's own characters escaped."""
+    """Escape reStructuredText in a text."""
     return re.sub(r"([\\*|`_])", r"\\\1", text)
 
 
 def verb_section(verb: str, text: str) -> str:
-    """One verb: usage, what it does, and its options as Sphinx' own ``option`` entries."""
+    """Return the section of a verb: usage, description, and its options as ``option`` directives of Sphinx."""
     above, found = boxes(text)
     usage, _, about = above.strip().partition("\n\n")
     usage = re.sub(r"^usage: ", "", usage)
@@ -199,7 +199,7 @@ def verb_section(verb: str, text: str) -> str:
 
 
 def command_line() -> str:
-    """All verbs, in the order of ``polarguide --help``."""
+    """Return the page of all verbs, in the order of ``polarguide --help``."""
     top = help_of()
     braces = re.search(r"\{([a-z,\-]+)\}", top)
     if braces is None:
@@ -211,14 +211,14 @@ def command_line() -> str:
 
 
 def write(path: Path, text: str) -> None:
-    """Write a page if it has changed: a page that stays need not be built again."""
+    """Write a page if its text has changed, so that Sphinx builds no page in vain."""
     path.parent.mkdir(parents=True, exist_ok=True)
     if not path.exists() or path.read_text(encoding="utf-8") != text:
         path.write_text(text, encoding="utf-8")
 
 
 def generate(app: Sphinx) -> None:
-    """Write all pages, and remove those of rooms that are no more."""
+    """Write all pages and remove pages of deleted rooms."""
     docs = Path(app.srcdir)
     pages = api_pages(docs)
     api = docs / "reference" / "api"

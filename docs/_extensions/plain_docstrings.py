@@ -1,4 +1,4 @@
-"""Docstrings of this project are plain text with ``code``, not reStructuredText: what would be markup is escaped."""
+"""Conversion of docstrings, which are plain text with ``code``, to reStructuredText."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ _MARKUP = re.compile(r"([\\*|`])|(?<=\w)_(?!\w)")
 
 
 def escaped(line: str) -> str:
-    """The line with markup escaped outside of ``literals``."""
+    """Escape markup outside of ``literals`` in a line."""
     parts = _LITERAL.split(line)
     parts[::2] = [_MARKUP.sub(lambda found: "\\" + found.group(), part) for part in parts[::2]]
     return "".join(parts)
 
 
 def indentation(line: str) -> int:
-    """Spaces before the text."""
+    """Return the indentation of a line."""
     return len(line) - len(line.lstrip())
 
 
 def names_of(found: Any) -> set[str]:
-    """What a docstring may describe entry by entry: parameters of a function, fields of a class."""
+    """Return the names that a docstring may list: parameters of a function, or fields of a class."""
     try:
         parameters = set(inspect.signature(found).parameters)
     except (TypeError, ValueError):
@@ -35,7 +35,7 @@ def names_of(found: Any) -> set[str]:
 
 
 def one_each(lines: list[str], names: set[str]) -> list[str]:
-    """Entries that share a line, ``width: pixels. height: pixels.``, each on a line of its own."""
+    """Put entries that share a line, such as ``width: pixels. height: pixels.``, on lines of their own."""
     if not names:
         return lines
     name = "(?:" + "|".join(map(re.escape, sorted(names))) + ")"
@@ -53,7 +53,7 @@ def one_each(lines: list[str], names: set[str]) -> list[str]:
 
 
 def plain(lines: list[str]) -> list[str]:
-    """Text to reStructuredText: markup is escaped; literals may span lines; an indented block is kept as it is."""
+    """Convert a text to reStructuredText. Literals may span lines, and indented blocks stay unchanged."""
     text = "\n".join(lines)
     # A literal that is broken over two lines is one literal.
     text = re.sub(r"``[^`]+``", lambda found: re.sub(r"\s*\n\s*", " ", found.group()), text)
@@ -78,12 +78,12 @@ def process(app: Sphinx, what: str, name: str, found: Any, options: Any, lines: 
 
 
 def skip(app: Sphinx, what: str, name: str, found: Any, skipped: bool, options: Any) -> bool | None:
-    """Fields of named tuples have no text of their own: the class describes them."""
+    """Remove the generic text of fields of named tuples, because the class describes them."""
     return True if (getattr(found, "__doc__", None) or "").startswith("Alias for field number") else None
 
 
 def leave_type_variables(app: Sphinx, environment: Any, node: Any, text: Any) -> Any:
-    """A type variable has no page: it is shown as it is."""
+    """Show a type variable without a link, because it has no page."""
     module, _, name = node.get("reftarget", "").rpartition(".")
     return text if isinstance(getattr(sys.modules.get(module), name, None), TypeVar) else None
 

@@ -143,7 +143,7 @@ def __dir__() -> list[str]:
 
 
 def _version() -> str:
-    """The installed version; pyproject.toml states it."""
+    """Return the installed version, as pyproject.toml states it."""
     metadata = importlib.import_module("importlib.metadata")
     try:
         return str(metadata.version("polarguide"))

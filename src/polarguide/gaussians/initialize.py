@@ -19,12 +19,13 @@ class Initialization:
     Attributes:
         shell: Gaussians far around the capture, for surroundings that SfM does not triangulate. None are added inside:
             random Gaussians among the cameras end as haze in front of them.
-        shell_radii: of the nearest and the farthest, in units of the cameras' distance from the median of the points.
+        shell_radii: distances of the nearest and the farthest from the median of the points, in units of the cameras'
+            distance. At this distance they have little parallax, as sky and horizon.
         opacity: initial opacity of all Gaussians.
     """
 
     shell: int = 4000
-    shell_radii: tuple[float, float] = (3.0, 12.0)
+    shell_radii: tuple[float, float] = (50.0, 200.0)
     opacity: float = 0.1
 
 
@@ -47,6 +48,19 @@ def camera_reach(points: np.ndarray, cameras: np.ndarray) -> tuple[np.ndarray, f
     """The median of the points [M, 3], and the distance from it within which nine tenths of the cameras [V, 3] are."""
     middle = np.median(points, axis=0)
     return middle, float(np.quantile(np.linalg.norm(cameras - middle, axis=1), 0.9))
+
+
+def stretch_steps(means: Tensor, before: Tensor, middle: Tensor, reach: float) -> None:
+    """Lengthen a step of the Gaussians beyond the cameras in proportion to their distance, in place.
+
+    The step of a Gaussian then has the same size in a picture at any distance.
+
+    Args:
+        means: [N, 3] positions after the step. before: [N, 3] positions before it.
+        middle: [3] median of the points. reach: distance of the cameras from it.
+    """
+    factor = ((before - middle).norm(dim=1, keepdim=True) / reach).clamp(min=1)
+    means.copy_(torch.where(factor > 1, torch.lerp(before, means, factor), means))
 
 
 def far_away(means: Tensor, points: Tensor, centers: Tensor, share: float = 1.0) -> Tensor:

@@ -16,7 +16,7 @@ from polarguide.visualization import figures
 CPU = torch.device("cpu")
 
 
-def drawn(monkeypatch, tmp_path: Path, scene, *, layers=True):
+def drawn(monkeypatch, tmp_path: Path, scene, *, layers=True, shown=None):
     """The tiles by row and column heading, and the scales, that a sheet of a scene is made of."""
     seen = {}
 
@@ -31,7 +31,10 @@ def drawn(monkeypatch, tmp_path: Path, scene, *, layers=True):
         if not layers:
             stokes = None
             del result.layers["specular"], result.layers["diffuse"]
-        sheet.add(view, ViewTarget.of_view(view, facts, CPU), result, stokes)
+        target = ViewTarget.of_view(view, facts, CPU).with_coverage(
+            torch.ones_like(view.invalid) if shown is None else shown
+        )
+        sheet.add(view, target, result, stokes)
     sheet.write(tmp_path / "errors.png")
     return seen
 
@@ -55,6 +58,21 @@ def test_heat_maps_have_the_colors_of_their_errors(monkeypatch, tmp_path):
     expected = figures.scalar_to_rgb(errors.mean(-1), 0, 0.2, "inferno")
     counts = (view.ground_truth.mask & ~view.invalid & ~view.saturated).numpy()
     assert (np.abs(tiles["S1, S2 error"].astype(int) - expected)[counts] <= 1).all()
+
+
+def test_stripes_mark_pixels_that_no_training_view_shows(monkeypatch, tmp_path):
+    shown = torch.ones(HEIGHT, WIDTH, dtype=torch.bool)
+    shown[:, WIDTH // 2 :] = False
+    plain, striped = (drawn(monkeypatch, tmp_path, known_scene(), shown=mask) for mask in (None, shown))
+    columns = plain["columns"]
+    for name in ("picture error", "S1, S2 error"):
+        before, after = (sheet["rows"][0][columns.index(name)] for sheet in (plain, striped))
+        changed = (before != after).any(-1)
+        assert not changed[:, : WIDTH // 2].any()
+        assert 0.1 < changed[:, WIDTH // 2 :].mean() < 0.3
+        assert (after[changed] == evaluate.NOT_COUNTED).all()
+    normals = columns.index("normal error")
+    assert np.array_equal(plain["rows"][0][normals], striped["rows"][0][normals])
 
 
 def test_columns_are_those_that_a_run_has(monkeypatch, tmp_path):
@@ -103,7 +121,8 @@ def test_a_sheet_on_disk(tmp_path):
     for view in scene.views:
         result, stokes, _ = rendered(view, 5)
         result.normal[3, 3] = torch.nan
-        sheet.add(view, ViewTarget.of_view(view, facts, CPU), result, stokes)
+        target = ViewTarget.of_view(view, facts, CPU).with_coverage(torch.ones_like(view.invalid))
+        sheet.add(view, target, result, stokes)
     sheet.write(tmp_path / "errors.png")
     picture = cv2.imread(str(tmp_path / "errors.png"))
     assert picture.shape[0] > 2 * HEIGHT

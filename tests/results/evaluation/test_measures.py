@@ -53,6 +53,20 @@ def test_stokes_error_over_the_foreground():
         )
 
 
+def test_scores_of_seen_pixels_are_those_of_a_view_without_the_others():
+    result, predicted, _ = rendered(VIEW, 5)
+    seen = torch.ones(HEIGHT, WIDTH, dtype=torch.bool)
+    seen[:, 5:11] = False
+    scores = score_view(ViewTarget.of_view(VIEW, FACTS, CPU).with_coverage(seen), result, stokes=predicted)
+    smaller = dataclasses.replace(VIEW, invalid=VIEW.invalid | ~seen)
+    expected = score_view(ViewTarget.of_view(smaller, FACTS, CPU), result, stokes=predicted)
+    for key in ("psnr", "ssim", "stokes_error"):
+        assert scores[f"{key}_seen"] == pytest.approx(expected[key], rel=1e-9), key
+        assert scores[f"{key}_seen"] != pytest.approx(scores[key], rel=1e-6), key
+    valid = ~VIEW.invalid
+    assert scores["seen_share"] == pytest.approx(float((seen & valid).sum() / valid.sum()))
+
+
 def test_stokes_error_of_no_prediction_and_of_the_truth():
     four = VIEW.intensities()
     truth = torch.stack((four.sum(0) / 2, four[0] - four[2], four[1] - four[3]))

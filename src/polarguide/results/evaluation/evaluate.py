@@ -8,7 +8,7 @@ import statistics
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
@@ -20,9 +20,16 @@ from polarguide.capture.view import listed
 from polarguide.core.errors import PolarguideError
 from polarguide.core.progress import SILENT, Reporter
 from polarguide.core.system import peak_memory_mib
+from polarguide.gaussians.initialize import camera_reach
 from polarguide.geometry.camera import Camera
 from polarguide.optics import Mount
 from polarguide.optics.color import shown
+from polarguide.results.evaluation.coverage import (
+    Coverage,
+    DepthMap,
+    depth_map_of_rendering,
+    depth_map_of_truth,
+)
 from polarguide.results.evaluation.mesh import mesh_scores
 from polarguide.results.evaluation.metrics import HAZE_DEPTH, Selection, normal_angles_deg
 from polarguide.results.evaluation.record import METRICS_FILE, code_digest, commit, write_metrics
@@ -48,6 +55,8 @@ BRIGHTEST = (0.05, 0.5)
 MAP = "inferno"
 NOT_COUNTED = 90
 """Gray level of pixels outside the mask of a score."""
+STRIPES = 48
+"""Number of stripes across a picture. They mark pixels whose content no training view shows."""
 COLUMNS = {
     "photograph": "photograph",
     "final": "picture error",
@@ -61,10 +70,29 @@ COLUMNS = {
 """Heading of each column of the error sheet. A column without pictures is left out."""
 
 
+class _SheetRow(NamedTuple):
+    """Row of the error sheet.
+
+    Attributes:
+        name: name of the view. pictures: pictures by column.
+        measured: [3, H, W, 3] measured Stokes vectors; None if the pictures do not determine them.
+        predicted: [3, H, W, 3] predicted Stokes vectors; None without a prediction.
+        mask: [H, W] pixels whose polarization counts. unseen: [H, W] pixels that no training view shows.
+    """
+
+    name: str
+    pictures: dict[str, Picture]
+    measured: Tensor | None
+    predicted: Tensor | None
+    mask: Tensor
+    unseen: Tensor
+
+
 class ErrorSheet:
     """Sheet of error maps: one row per view, one color key per column.
 
     Heat maps are black at zero error and bright at the end of their scale. Pixels without a score are gray.
+    Gray stripes in the error of picture and polarization mark pixels whose content no training view shows.
 
     - Layers and picture: absolute difference of displayed values, mean over channels.
     - Polarization: mean Stokes vector of the channels, with AoLP as hue and DoLP as brightness.
@@ -79,8 +107,7 @@ class ErrorSheet:
     def __init__(self, views: int) -> None:
         self._chosen = range(0, views, max(1, math.ceil(views / MOST_VIEWS)))
         self._added = 0
-        # Name, pictures, measured Stokes vectors, predicted ones, mask. The scales depend on all views.
-        self._rows: list[tuple[str, dict[str, Picture], Tensor | None, Tensor | None, Tensor]] = []
+        self._rows: list[_SheetRow] = []
 
     def add(self, view: View, target: ViewTarget, result: RenderResult, stokes: Tensor | None) -> None:
         """Add the next view if the sheet draws it.
@@ -104,10 +131,12 @@ class ErrorSheet:
         if "normal" in result.layers and target.normal is not None and target.surface is not None:
             angles = normal_angles_deg(result.normal.nan_to_num(), target.normal)
             pictures["normal"] = _heat(angles, target.surface.mask, NORMAL_HIGH)
+        unseen = target.unseen.cpu()
+        _hatch(pictures["final"], unseen)
         keep = target.valid if target.polarized is None else target.polarized
         predicted = None if stokes is None else stokes.cpu().nan_to_num()
         measured = view.stokes() if view.is_determined else None
-        self._rows.append((view.name, pictures, measured, predicted, keep.mask.cpu()))
+        self._rows.append(_SheetRow(view.name, pictures, measured, predicted, keep.mask.cpu(), unseen))
 
     def write(self, path: Path) -> None:
         """Write the sheet, or no file if it has no view."""
@@ -115,13 +144,11 @@ class ErrorSheet:
             return
         ends = {**dict.fromkeys(("final", "specular", "diffuse"), PICTURE_HIGH), "normal": NORMAL_HIGH}
         headings = dict(COLUMNS)
-        if any(measured is not None and predicted is not None for _, _, measured, predicted, _ in self._rows):
+        if any(row.measured is not None and row.predicted is not None for row in self._rows):
             brightest, ends["stokes"] = self._draw_polarization()
             headings["measured"] = f"AoLP x DoLP / {brightest:g}"
-        keys = [key for key in COLUMNS if any(key in pictures for _, pictures, *_ in self._rows)]
-        rows: list[list[Picture | None]] = [
-            [pictures.get(key) for key in keys] for _, pictures, *_ in self._rows
-        ]
+        keys = [key for key in COLUMNS if any(key in row.pictures for row in self._rows)]
+        rows: list[list[Picture | None]] = [[row.pictures.get(key) for key in keys] for row in self._rows]
         bars = {
             key: figures.scale_bar(0.0, end, MAP, "deg" if key == "normal" else "")
             for key, end in ends.items()
@@ -130,7 +157,7 @@ class ErrorSheet:
         bars["photograph"] = figures.color_patch(NOT_COUNTED, "gray: not counted")
         sheet = contact_sheet(
             rows,
-            [name for name, *_ in self._rows],
+            [row.name for row in self._rows],
             [headings[key] for key in keys],
             footer=[bars[key] for key in keys],
         )
@@ -138,17 +165,18 @@ class ErrorSheet:
 
     def _draw_polarization(self) -> tuple[float, float]:
         """Add the pictures of polarization; return the DoLP at full brightness and the end of the error scale."""
-        counted = [measured[:, keep] for _, _, measured, _, keep in self._rows if measured is not None]
+        counted = [row.measured[:, row.mask] for row in self._rows if row.measured is not None]
         degrees = torch.cat([optics.dolp(optics.luminance(values)) for values in counted])
         brightest = min(max(_rounded_percentile(degrees), BRIGHTEST[0]), BRIGHTEST[1])
         high = _rounded_percentile(torch.cat([_polarization_magnitude(values) for values in counted]))
-        for _, pictures, measured, predicted, keep in self._rows:
+        for _, pictures, measured, predicted, keep, unseen in self._rows:
             if measured is None:
                 continue
             pictures["measured"] = _polarization(measured, brightest)
             if predicted is not None:
                 pictures["predicted"] = _polarization(predicted, brightest)
                 pictures["stokes"] = _heat(_polarization_magnitude(predicted - measured), keep, high)
+                _hatch(pictures["stokes"], unseen)
         return brightest, high
 
 
@@ -161,6 +189,15 @@ def _heat(values: Tensor, keep: Tensor, high: float) -> Picture:
     picture = figures.scalar_to_rgb(values, 0.0, high, MAP)
     picture[~keep.cpu().numpy()] = NOT_COUNTED
     return picture
+
+
+def _hatch(picture: Picture, unseen: Tensor) -> None:
+    """Draw diagonal stripes over the pixels [H, W] whose content no training view shows."""
+    height, width = unseen.shape
+    diagonal = torch.arange(height)[:, None] + torch.arange(width)
+    spacing = max(4, width // STRIPES)
+    stripes = unseen & (diagonal % spacing < spacing // 4)
+    picture[stripes.numpy()] = NOT_COUNTED
 
 
 def _polarization_magnitude(stokes: Tensor) -> Tensor:
@@ -320,12 +357,13 @@ def evaluate(
     fitted = [view.name for view in tests if not view.measures_radiance]
     if fitted:
         reporter.say(f"scored with an analyzer fitted on the other half of the picture: {listed(fitted)}")
+    coverage = _coverage(run, reporter)
     views = {}
     by_object = ErrorsByObject(facts.objects)
     sheet = ErrorSheet(len(tests))
     with reporter.track("scoring", len(tests)) as advance:
         for view in tests:
-            views[view.name] = _score(run, view, facts, by_object, sheet)
+            views[view.name] = _score(run, view, facts, coverage.seen[view.name], by_object, sheet)
             advance(len(views))
     sheet.write(run.folder / ERRORS_FILE)
     memory = _peak_memory(peak_before)  # The mesh scores below are not part of rendering.
@@ -357,11 +395,47 @@ def evaluate(
     )
 
 
+def _coverage(run: ScoredRun, reporter: Reporter) -> Coverage:
+    """Find the pixels of the test views whose content a training view shows.
+
+    Depths of test views come from the ground truth where it has them. All others are rendered.
+    """
+    scene = run.scene
+    training = scene.train_views
+    centers = torch.stack([view.camera.center for view in training])
+    middle, radius = camera_reach(
+        (scene.points if len(scene.points) else centers).double().numpy(), centers.numpy()
+    )
+
+    def surface(view: View) -> DepthMap:
+        result = run.model.render(view.camera, normals=False, depth=True, surface=True)
+        return depth_map_of_rendering(
+            view.camera, result.depth, result.alpha, torch.from_numpy(middle), radius
+        )
+
+    held_out = {}
+    for view in scene.test_views:
+        truth = view.ground_truth
+        known = None if truth is None else truth.depth
+        held_out[view.name] = surface(view) if known is None else depth_map_of_truth(view.camera, known)
+    coverage = Coverage(held_out)
+    with reporter.track("finding the photographed pixels", len(training)) as advance:
+        for count, view in enumerate(training, start=1):
+            coverage.add(surface(view))
+            advance(count)
+    return coverage
+
+
 def _score(
-    run: ScoredRun, view: View, facts: SceneFacts, by_object: ErrorsByObject, sheet: ErrorSheet
+    run: ScoredRun,
+    view: View,
+    facts: SceneFacts,
+    seen: Tensor,
+    by_object: ErrorsByObject,
+    sheet: ErrorSheet,
 ) -> ViewScores:
     # The target comes first: a later copy to the device would wait for the rendering.
-    target = ViewTarget.of_view(view, facts, run.model.device)
+    target = ViewTarget.of_view(view, facts, run.model.device).with_coverage(seen)
     result = run.model.render(view.camera, depth=True, surface=True)
     stokes = run.model.stokes(result, view.camera)
     if not view.measures_radiance:

@@ -280,6 +280,18 @@ def beyond_share(pred: Tensor, true: Tensor, keep: Selection) -> Tensor:
     return beyond.to(torch.float64).mean()
 
 
+def seen_share(pred: Tensor, seen: Selection, valid: Selection) -> Tensor:
+    """Return the share of the valid pixels whose content a training view shows; NaN without valid pixels.
+
+    Args:
+        pred: the rendered picture, for its device.
+        seen: valid pixels whose content a training view shows.
+        valid: the pixels that count.
+    """
+    count = pred.new_tensor(len(valid.places), dtype=torch.float64)
+    return len(seen.places) / torch.where(count > 0, count, torch.nan)
+
+
 def coverage_error(alpha: Tensor, mask: Tensor, keep: Selection) -> Tensor:
     """Compute the mean |alpha - mask| of [H, W] in [0, 1]; NaN without a pixel to score."""
     return (keep.pick(alpha) - keep.pick(mask)).abs().mean()

@@ -181,6 +181,8 @@ class ViewTarget:
         smooth: valid pixels with a true depth, at least 2 pixels from any jump of it.
         mask: [H, W] float64, 1 in the foreground; only if the pictures show nothing else.
         beyond: valid pixels more than 3 pixels outside that mask.
+        seen: valid pixels whose content a training view shows; None if not determined.
+        seen_windows: those that are centers of SSIM windows. seen_polarized: those of ``polarized``.
         extent: extent of the scene in world units.
     """
 
@@ -202,6 +204,9 @@ class ViewTarget:
     smooth: Selection | None = None
     mask: Tensor | None = None
     beyond: Selection | None = None
+    seen: Selection | None = None
+    seen_windows: Selection | None = None
+    seen_polarized: Selection | None = None
     extent: float = 1.0
 
     @classmethod
@@ -280,6 +285,23 @@ class ViewTarget:
             mask=_on_device(mask, device),
             beyond=_selection(None if mask is None else outside(mask) & ~view.invalid, device),
             extent=facts.extent,
+        )
+
+    @property
+    def unseen(self) -> Tensor:
+        """Valid pixels [H, W] bool whose content no training view shows; none if not determined."""
+        return self.valid.mask & ~(self.valid if self.seen is None else self.seen).mask
+
+    def with_coverage(self, seen: Tensor) -> ViewTarget:
+        """Return the target with the pixels [H, W] bool (CPU) whose content a training view shows."""
+        device = self.photograph.device
+        counted = seen & self.valid.mask.cpu()
+        polarized = None if self.polarized is None else counted & self.polarized.mask.cpu()
+        return replace(
+            self,
+            seen=Selection.of(counted, device),
+            seen_windows=Selection.of(window_centers(counted), device),
+            seen_polarized=_selection(polarized, device),
         )
 
 
