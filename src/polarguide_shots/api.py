@@ -49,7 +49,7 @@ def priors(
     Args:
         scene: a scene with poses, or its folder.
         out: folder to write.
-        run, views, threshold: see ``results.rendering.priors.write_priors``.
+        run, views, threshold: see ``results.rendering.pictures.write_priors``.
         refractive_index: refractive index of the surfaces; None: the value in ``scene.json``, else 1.5.
         reading: options of reading a scene folder.
         formats: formats of the maps of ``shot_priors`` (png, exr, npy, page), written to a folder for each view.
