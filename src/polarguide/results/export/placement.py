@@ -123,7 +123,7 @@ class Placement:
         for channel in range(3):
             # f_rest is channel-major; linear_rest has the channel last.
             _transform(table, [f"f_rest_{channel * REST_COUNT + k}" for k in range(REST_COUNT)], matrix)
-            if "linear_rest_0" in table.dtype.fields:
+            if "linear_rest_0" in (table.dtype.names or ()):
                 _transform(table, [f"linear_rest_{3 * k + channel}" for k in range(REST_COUNT)], matrix)
 
     def record(self) -> dict[str, Any]:

@@ -228,7 +228,7 @@ class LayerTexts(NamedTuple):
 
 
 WORDS = {
-    "final": LayerTexts("picture", "the picture of a camera"),
+    "final": LayerTexts("picture", "a photograph from this pose"),
     "diffuse": LayerTexts("without gloss", "the color and shading of surfaces, without reflections"),
     "specular": LayerTexts("gloss alone", "only the reflections of surfaces"),
     "base": LayerTexts("below the gloss", "the color of the layer under the reflections"),
