@@ -29,7 +29,7 @@ nitpick_ignore_regex = [("py:.*", r"(?!polarguide[._]).*|.*\[.*|.*\.T")]  # the 
 
 myst_enable_extensions = ["attrs_block", "attrs_inline", "colon_fence", "deflist", "dollarmath"]
 myst_heading_anchors = 3
-# A notebook that fails is an error. What it writes is gone afterwards.
+# A notebook that fails is an error. Its files are temporary.
 nb_execution_mode = "auto"
 nb_execution_in_temp = True
 nb_execution_timeout = 900  # a cell takes a minute; a machine with other work is slow

@@ -1,4 +1,4 @@
-"""Render from cameras that no photograph was taken from: a turn around the scene, written as PNG files.
+"""Render from new cameras: a turn around the scene, written as PNG files.
 
 python examples/02_cameras_of_your_own.py runs/demo turn
 """

@@ -1,4 +1,4 @@
-"""Where does a scene reflect most? The share of specular light in each view, and the strongest Gaussians.
+"""Find the strongest reflections of a scene: the share of specular light in each view, and the strongest Gaussians.
 
 python examples/03_find_what_reflects.py runs/demo
 """

@@ -1,4 +1,4 @@
-"""Train with a callback of your own: no Gaussian becomes quite opaque.
+"""Train with your own callback: no Gaussian becomes completely opaque.
 
 python examples/05_train_with_a_callback.py src/polarguide/data/demo runs/capped 400
 """
@@ -13,7 +13,7 @@ from polarguide.training.callback import Callback
 
 
 class OpacityCap(Callback):
-    """Lowers opacities to a limit, every so many steps, and counts how often it had to."""
+    """Callback that clamps opacities to a limit at regular steps, and counts the changes."""
 
     name = "opacity_cap"
 

@@ -28,8 +28,8 @@ class CoatedShading(DeferredShading):
     """final = base + strength F light + 0.04 coat light, with Fresnel's reflectance F."""
 
     @property
-    def added_surface(self):
-        return (COAT,)
+    def surface(self):
+        return (*super().surface, COAT)
 
     def shade(self, splatted, light, camera):
         layers = super().shade(splatted, light, camera)

@@ -1,4 +1,4 @@
-// What the bindings take: contiguous float32 arrays on the CPU, with their shapes checked.
+// Arguments of the bindings: contiguous float32 arrays on the CPU with checked shapes.
 #pragma once
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
@@ -26,7 +26,7 @@ inline void expect_shape(const Array &array, const char *name, std::initializer_
     throw std::invalid_argument(std::string(name) + ": expected shape [" + wanted + "], found [" + found + "]");
 }
 
-// The texels along an edge of a cubemap [6,R,R,C]; raises ValueError unless it is one.
+// Returns the number of texels along an edge of a cubemap [6,R,R,C]; raises ValueError for other shapes.
 inline int64_t cubemap_side(const Array &texture) {
     const int64_t side = texture.ndim() == 4 ? int64_t(texture.shape(1)) : 0;
     expect_shape(texture, "texture", {6, side, side, texture.ndim() == 4 ? int64_t(texture.shape(3)) : 0});

@@ -1,4 +1,4 @@
-// Normals of flat Gaussians, their shortest axes turned outward, and directions mirrored at them.
+// Normals of flat Gaussians (their shortest axes, turned outward), and directions mirrored at normals.
 #include "gaussians.h"
 #include "simd.h"
 
@@ -10,17 +10,17 @@ namespace {
 
 constexpr float tiny = 1e-24f;
 
-// Of as many Gaussians as a register has lanes.
+// Shortest axes of one Gaussian per lane of a register.
 struct Axis {
-    reg chosen[3];     // the shortest of x, y, z: 1, the others 0
+    reg chosen[3];     // 1 for the shortest of x, y, z, else 0
     reg turn;          // 1 or -1
     reg quaternion[4]; // (w, x, y, z), of any length
     reg axis[3];
     reg twice; // 2 / |q|^2
 };
 
-// The shortest axis under the rotation of a quaternion (w, x, y, z) of any length, turned outward: with e the chosen axis
-// and u = (x, y, z) it is e + 2 / |q|^2 (u u.e + w u x e - e u.u). Gaussians i to i + n.
+// Computes the shortest axes of Gaussians i to i + n, turned outward. A quaternion (w, x, y, z) of any length rotates the chosen
+// axis e to e + 2 / |q|^2 (u u.e + w u x e - e u.u) with u = (x, y, z).
 POLARGUIDE_INLINE Axis outward_axis(const AxesArgs &a, int64_t i, int n) {
     const reg one = reg_splat(1.0f), zero = {};
     reg s[3], m[3];
@@ -66,8 +66,8 @@ void axes_forward(const AxesArgs &a, int64_t begin, int64_t end) {
     }
 }
 
-// The axis is e + t v, t = 2 / |q|^2, v = u u.e + w u x e - e u.u: the gradient is that of v times t, less the part that
-// t's own change brings, which is along q.
+// The axis is e + t v with t = 2 / |q|^2 and v = u u.e + w u x e - e u.u. The gradient is t times the gradient of v, minus a
+// part along q from the change of t.
 void axes_backward(const AxesArgs &a, int64_t begin, int64_t end) {
     for (int64_t i = begin; i < end; i += reg_lanes) {
         const int n = end - i < reg_lanes ? int(end - i) : reg_lanes;
@@ -91,7 +91,7 @@ void axes_backward(const AxesArgs &a, int64_t begin, int64_t end) {
     }
 }
 
-// Unit directions from the center to the means, mirrored at unit normals; zero for a mean at the center.
+// Computes unit directions from the center to the means, mirrored at unit normals; zero for a mean at the center.
 void mirrored_forward(const AxesArgs &a, int64_t begin, int64_t end) {
     for (int64_t i = begin; i < end; ++i) {
         const float *m = a.means + 3 * i, *n = a.normals + 3 * i;

@@ -56,8 +56,8 @@ HarmonicsArgs harmonics_args(int degree, const Array &means, const Array &center
 
 float *data_of(const std::optional<Array> &array) { return array ? array->data() : nullptr; }
 
-// Gaussians as a training has them, with what a shading model splats. The kernels of axes and harmonics do their parts of a
-// chunk in a worker's own memory, from which the rows of features are then put together.
+// Parameters of Gaussians and of a shading model's channels. For each chunk, the kernels of axes and harmonics write to the
+// memory of a worker, and the rows of features are then assembled from it.
 class Splatting {
   public:
     Splatting(Array means, Array quaternions, Array log_scales, Array opacity_logits, Array dc, Array rest, int degree,
@@ -121,7 +121,7 @@ class Splatting {
         });
     }
 
-    // Given by the rasterizer, of the results: `grad_`; gradients of the parameters: `to_`.
+    // `grad_`: gradients of the results, from the rasterizer. `to_`: gradients of the parameters.
     void backward(const Array &scales, const Array &opacities, const Array &features, std::optional<Array> mirrored,
                   const Array &grad_means, const Array &grad_quaternions, const Array &grad_scales, const Array &grad_opacities,
                   const Array &grad_features, Array to_means, Array to_quaternions, Array to_log_scales, Array to_opacity_logits,
@@ -172,7 +172,7 @@ class Splatting {
     }
 
   private:
-    static constexpr int64_t most_values = 3 + 3 + 3 + 3 + 1 + 4; // that a chunk's memory holds of each Gaussian
+    static constexpr int64_t most_values = 3 + 3 + 3 + 3 + 1 + 4; // per Gaussian in the memory of a chunk
     static float *take(float **memory, int values) {
         float *found = *memory;
         *memory += values * splat_chunk;
@@ -249,7 +249,7 @@ void bind_gaussians(nb::module_ &module) {
             run(POLARGUIDE_DISPATCH(axes_forward), a, n);
         },
         nb::arg("means"), nb::arg("quaternions"), nb::arg("log_scales"), nb::arg("center"), nb::arg("outward").none(),
-        nb::arg("grazing"), nb::arg("out"), "Shortest axes turned outward.");
+        nb::arg("grazing"), nb::arg("out"), "Compute shortest axes, turned outward.");
     module.def(
         "axes_backward",
         [](const Array &means, const Array &quaternions, const Array &log_scales, const Array &center,
@@ -261,7 +261,7 @@ void bind_gaussians(nb::module_ &module) {
             run(POLARGUIDE_DISPATCH(axes_backward), a, n);
         },
         nb::arg("means"), nb::arg("quaternions"), nb::arg("log_scales"), nb::arg("center"), nb::arg("outward").none(),
-        nb::arg("grazing"), nb::arg("grad_out"), nb::arg("grad_quaternions"), "Fills the gradient.");
+        nb::arg("grazing"), nb::arg("grad_out"), nb::arg("grad_quaternions"), "Compute the gradient.");
     module.def(
         "mirrored_forward",
         [](const Array &means, const Array &center, const Array &normals, Array out) {
@@ -273,7 +273,7 @@ void bind_gaussians(nb::module_ &module) {
             run(POLARGUIDE_DISPATCH(mirrored_forward), a, n);
         },
         nb::arg("means"), nb::arg("center"), nb::arg("normals"), nb::arg("out"),
-        "Rays from the center, mirrored at unit normals.");
+        "Mirror rays from the center at unit normals.");
     module.def(
         "harmonics_forward",
         [](int degree, const Array &means, const Array &center, const Array &dc, const Array &rest, Array out) {
@@ -286,7 +286,7 @@ void bind_gaussians(nb::module_ &module) {
             parallel_chunks(n, item_chunk, body);
         },
         nb::arg("degree"), nb::arg("means"), nb::arg("center"), nb::arg("dc"), nb::arg("rest"), nb::arg("out"),
-        "Sum of the harmonics toward each Gaussian.");
+        "Evaluate the harmonics of each Gaussian in its direction.");
     module.def(
         "harmonics_backward",
         [](int degree, const Array &means, const Array &center, const Array &dc, const Array &rest,
@@ -304,23 +304,23 @@ void bind_gaussians(nb::module_ &module) {
             parallel_chunks(n, item_chunk, body);
         },
         nb::arg("degree"), nb::arg("means"), nb::arg("center"), nb::arg("dc"), nb::arg("rest"), nb::arg("grad_out"),
-        nb::arg("grad_means").none(), nb::arg("grad_dc"), nb::arg("grad_rest").none(), "Fills the gradients that are not None.");
-    nb::class_<Splatting>(module, "Splatting", "From the parameters of Gaussians to what a rasterizer takes, and back.")
+        nb::arg("grad_means").none(), nb::arg("grad_dc"), nb::arg("grad_rest").none(), "Compute the gradients that are not None.");
+    nb::class_<Splatting>(module, "Splatting", "Input of a rasterizer from the parameters of Gaussians, and its gradient.")
         .def(nb::init<Array, Array, Array, Array, Array, Array, int, Array, std::optional<Array>, bool, float, std::optional<Array>,
                       std::optional<Array>, std::optional<Array>, std::optional<Array>, std::optional<Array>, std::optional<Array>>(),
              nb::arg("means"), nb::arg("quaternions"), nb::arg("log_scales"), nb::arg("opacity_logits"), nb::arg("dc"),
              nb::arg("rest"), nb::arg("degree"), nb::arg("center"), nb::arg("forward").none(), nb::arg("normals"),
              nb::arg("grazing"), nb::arg("outward").none(), nb::arg("strength").none(), nb::arg("light_dc").none(),
              nb::arg("light_rest").none(), nb::arg("metalness").none(), nb::arg("further").none())
-        .def_prop_ro("channels", &Splatting::channels, "Features of a Gaussian.")
+        .def_prop_ro("channels", &Splatting::channels, "Number of features of a Gaussian.")
         .def("forward", &Splatting::forward, nb::arg("scales"), nb::arg("opacities"), nb::arg("features"),
-             nb::arg("mirrored").none(), "Fills them; `mirrored`, which `backward` asks for where there is light, may be None.")
+             nb::arg("mirrored").none(), "Compute the input. `mirrored` may be None unless `backward` follows and there is light.")
         .def("backward", &Splatting::backward, nb::arg("scales"), nb::arg("opacities"), nb::arg("features"),
              nb::arg("mirrored").none(), nb::arg("grad_means"), nb::arg("grad_quaternions"), nb::arg("grad_scales"),
              nb::arg("grad_opacities"), nb::arg("grad_features"), nb::arg("to_means"), nb::arg("to_quaternions"),
              nb::arg("to_log_scales"), nb::arg("to_opacity_logits"), nb::arg("to_dc"), nb::arg("to_rest"),
              nb::arg("to_strength").none(), nb::arg("to_light_dc").none(), nb::arg("to_light_rest").none(),
-             nb::arg("to_further").none(), "Fills the gradients.");
+             nb::arg("to_further").none(), "Compute the gradients.");
     module.def(
         "shortest_sum",
         [](const Array &log_scales, const Array &radii) {
@@ -339,7 +339,7 @@ void bind_gaussians(nb::module_ &module) {
             for (size_t i = 0; i < sums.size(); ++i) sum += sums[i], count += counts[i];
             return std::tuple<double, double>(sum, count);
         },
-        nb::arg("log_scales"), nb::arg("radii"), "Sum of the shortest scales of the Gaussians that are seen, and how many they are.");
+        nb::arg("log_scales"), nb::arg("radii"), "Return the sum of the shortest scales of visible Gaussians, and their number.");
     module.def(
         "shortest_gradient",
         [](const Array &log_scales, const Array &radii, float factor, Array gradient) {
@@ -351,5 +351,5 @@ void bind_gaussians(nb::module_ &module) {
             auto body = [&](int64_t b, int64_t e, int) { POLARGUIDE_DISPATCH(shortest_gradient)(a, b, e); };
             parallel_chunks(n, item_chunk, body);
         },
-        nb::arg("log_scales"), nb::arg("radii"), nb::arg("factor"), nb::arg("gradient"), "Fills the factor times the gradient of the sum.");
+        nb::arg("log_scales"), nb::arg("radii"), nb::arg("factor"), nb::arg("gradient"), "Compute the factor times the gradient of the sum.");
 }

@@ -25,8 +25,8 @@ int64_t rows(const Array &array) { return array.ndim() ? int64_t(array.shape(0))
 
 constexpr int64_t row_chunk = 8, item_chunk = 2048, merge_chunk = 16384;
 
-// Work memory of the photometric loss: five planes and a scratch for each worker. Not cleared: every float is written
-// before it is read.
+// Work memory of the photometric loss: five planes and a scratch for each worker. It is not cleared, because each float is
+// written before it is read.
 class PhotometricMemory {
   public:
     PhotometricMemory(PhotometricArgs &a, int workers)
@@ -82,9 +82,9 @@ CubemapArgs cubemap_args(const Array &texture, const Array &directions) {
     return a;
 }
 
-// The gradient of the texels is summed in slices of the directions, which are then added in order: the number of slices
-// follows from the sizes alone, so that the result does not depend on the number of threads. A slice costs a pass over
-// the texels: worth it only where it brings at least as many taps. `add(begin, end, sums)` adds what some directions bring.
+// Sums the gradient of the texels in slices of the directions and adds the slices in order. The number of slices depends only
+// on the sizes, so the result does not depend on the number of threads. A slice costs a pass over the texels, so it has at
+// least as many taps as texels. `add(begin, end, sums)` adds the contribution of some directions.
 template <class Add> void sum_texture_gradient(int64_t texels, int64_t channels, int64_t count, float *gradient, Add add) {
     const int64_t size = texels * channels;
     const int64_t worth = std::min(count / 16384, 4 * count / texels), slices = std::clamp<int64_t>(worth, 1, 8);
@@ -120,7 +120,7 @@ MipArgs placed_mips(const std::vector<Array> &textures, const Array &directions,
 void bind_image(nb::module_ &module) {
     module.def("photometric", &photometric, nb::arg("prediction"), nb::arg("target"), nb::arg("weight").none(),
                nb::arg("weight_sum"), nb::arg("ssim_weight"), nb::arg("gradient").none(),
-               "Mean absolute difference, SSIM and squared difference of shown pictures; fills the gradient of the first two's mix.");
+               "Return mean absolute difference, SSIM and squared difference of display values; compute the gradient of the loss.");
     module.def(
         "cubemap_forward",
         [](const Array &texture, const Array &directions, Array out) {
@@ -132,7 +132,7 @@ void bind_image(nb::module_ &module) {
             auto body = [&](int64_t b, int64_t e, int) { POLARGUIDE_DISPATCH(cubemap_forward)(a, b, e); };
             parallel_chunks(count, item_chunk, body);
         },
-        nb::arg("texture"), nb::arg("directions"), nb::arg("out"), "Seamless bilinear look-up.");
+        nb::arg("texture"), nb::arg("directions"), nb::arg("out"), "Look up a cubemap seamlessly and bilinearly.");
     module.def(
         "cubemap_backward",
         [](const Array &texture, const Array &directions, const Array &grad_out, std::optional<Array> grad_texture,
@@ -151,7 +151,7 @@ void bind_image(nb::module_ &module) {
             if (grad_texture) sum_texture_gradient(6 * side * side, a.channels, count, grad_texture->data(), add);
         },
         nb::arg("texture"), nb::arg("directions"), nb::arg("grad_out"), nb::arg("grad_texture").none(),
-        nb::arg("grad_directions").none(), "Fills the gradients that are not None.");
+        nb::arg("grad_directions").none(), "Compute the gradients that are not None.");
     module.def(
         "mips_forward",
         [](const std::vector<Array> &textures, const Array &directions, const Array &level, Array out) {
@@ -163,7 +163,7 @@ void bind_image(nb::module_ &module) {
             auto body = [&](int64_t b, int64_t e, int) { POLARGUIDE_DISPATCH(mips_forward)(a, b, e); };
             parallel_chunks(count, item_chunk, body);
         },
-        nb::arg("textures"), nb::arg("directions"), nb::arg("level"), nb::arg("out"), "Look-up between mip levels.");
+        nb::arg("textures"), nb::arg("directions"), nb::arg("level"), nb::arg("out"), "Look up between mip levels.");
     module.def(
         "mips_backward",
         [](const std::vector<Array> &textures, const Array &directions, const Array &level, const Array &grad_out,
@@ -184,5 +184,5 @@ void bind_image(nb::module_ &module) {
         },
         nb::arg("textures"), nb::arg("directions"), nb::arg("level"), nb::arg("grad_out"), nb::arg("grad_light").none(),
         nb::arg("grad_textures").none(), nb::arg("grad_directions"), nb::arg("grad_level"),
-        "Gradients; those of the textures in a row, if not None. Those of textures and levels are by grad_light, if not None.");
+        "Compute gradients; those of the textures, one after the other, unless None. A grad_light replaces grad_out for textures and levels.");
 }

@@ -35,7 +35,7 @@ GaussianInputs inputs(const Array &means, const Array &quaternions, const Array 
     return {n, d, means.data(), quaternions.data(), scales.data(), opacities.data(), features.data()};
 }
 
-// Every channel once; the rasterizer takes these at their word.
+// Checks that each channel occurs once; the rasterizer does not check it again.
 void expect_permutation(const std::vector<int32_t> &permutation, int statistic_channels) {
     const size_t count = permutation.size();
     if (count < 1 || count > size_t(max_channels))
@@ -52,7 +52,7 @@ void expect_permutation(const std::vector<int32_t> &permutation, int statistic_c
                                     std::to_string(statistic_channels));
 }
 
-// Which of the still channels each channel is; each at most once.
+// Returns the place of each channel among the still channels; each occurs at most once.
 std::vector<int32_t> inverse(const std::vector<int32_t> &still, int channels) {
     std::vector<int32_t> of_channel(size_t(channels), -1);
     for (size_t i = 0; i < still.size(); ++i) {
@@ -75,7 +75,7 @@ struct Wrapped {
 } // namespace
 
 void bind_raster(nb::module_ &module) {
-    nb::class_<Wrapped>(module, "Rasterizer", "One picture: the forward pass and what its backward pass needs.")
+    nb::class_<Wrapped>(module, "Rasterizer", "Rasterizer of one picture: forward pass, data for the backward pass, and backward pass.")
         .def(
             "__init__",
             [](Wrapped *self, const std::vector<float> &rotation, const std::vector<float> &translation,
@@ -105,7 +105,7 @@ void bind_raster(nb::module_ &module) {
                 expect_shape(out, "out", {self.height, self.width, self.channels});
                 expect_shape(alpha, "alpha", {self.height, self.width});
                 expect_shape(radius, "radius", {in.count});
-                self.drawn = nothing_drawn; // until it is whole
+                self.drawn = nothing_drawn; // until the pass is complete
                 nb::gil_scoped_release release;
                 self.rasterizer.forward(in, out.data(), alpha.data(), radius.data(), count_pairs, for_backward);
                 self.drawn = in.count;
@@ -163,13 +163,13 @@ void bind_raster(nb::module_ &module) {
             nb::arg("d_scales"), nb::arg("d_opacities"), nb::arg("d_features"), nb::arg("statistic").none(),
             nb::arg("still") = std::vector<int32_t>{}, nb::arg("grad_still") = nb::none())
         .def_prop_ro("pairs", [](const Wrapped &self) { return self.rasterizer.pairs(); },
-                     "Contributing pixel-Gaussian pairs of the last forward pass that counted them.")
+                     "Number of contributing pixel-Gaussian pairs in the last forward pass that counted them.")
         .def_prop_ro("instances", [](const Wrapped &self) { return self.rasterizer.instances(); },
-                     "Gaussian-tile pairs of the last forward pass.");
+                     "Number of Gaussian-tile pairs in the last forward pass.");
     module.def(
         "first_not_finite",
         [](const Array &array) { return POLARGUIDE_DISPATCH(first_not_finite)(array.data(), int64_t(array.size())); },
-        nb::arg("array"), "Flat index of the first NaN or infinity, or -1.");
+        nb::arg("array"), "Return the flat index of the first NaN or infinity, or -1.");
     module.attr("MAX_CHANNELS") = max_channels;
     module.def(
         "fma_peak",
@@ -192,5 +192,5 @@ void bind_raster(nb::module_ &module) {
             }
             return best;
         },
-        nb::arg("seconds") = 0.5, "Best single-precision flop/s seen: independent fused multiply-adds on all threads.");
+        nb::arg("seconds") = 0.5, "Measure the maximum single-precision flop/s of independent fused multiply-adds on all threads.");
 }

@@ -81,7 +81,7 @@ void bind_metal(nb::module_ &module) {
         },
         nb::arg("features"), nb::arg("rays"), nb::arg("pixels"), nb::arg("first"), nb::arg("least_share"), nb::arg("light"),
         nb::arg("share"), nb::arg("reflected"), nb::arg("slope"), nb::arg("final"), nb::arg("specular"),
-        "What metals reflect, which is added to two layers.");
+        "Compute the reflection of metals and add it to two layers.");
     module.def(
         "metal_backward",
         [](const Array &features, const Array &rays, const Indices &pixels, int first, float least_share, const Array &light,
@@ -102,10 +102,10 @@ void bind_metal(nb::module_ &module) {
         nb::arg("features"), nb::arg("rays"), nb::arg("pixels"), nb::arg("first"), nb::arg("least_share"), nb::arg("light"),
         nb::arg("grad_final").none(), nb::arg("grad_specular").none(), nb::arg("grad_held").none(),
         nb::arg("grad_reflected").none(), nb::arg("grad_slope").none(), nb::arg("grad_light"), nb::arg("grad_normal"),
-        nb::arg("grad_metal"), "Adds the gradient by the light; fills those by normals, and by reflectance and share as blended.");
+        nb::arg("grad_metal"), "Add the gradient of the light; compute the gradients of normals, and of blended reflectance and share.");
 }
 
-// The look-up between levels; of a single one without the work of two.
+// Looks up between levels; a single level avoids the work for two.
 void look_up(const MipArgs &mips, int64_t count) {
     if (mips.levels > 1) return POLARGUIDE_DISPATCH(mips_forward)(mips, 0, count);
     CubemapArgs one{};
@@ -114,7 +114,7 @@ void look_up(const MipArgs &mips, int64_t count) {
     POLARGUIDE_DISPATCH(cubemap_forward)(one, 0, count);
 }
 
-// The channel of roughness, and what its levels need.
+// Sets the channel of roughness and the arguments of its levels.
 void set_roughness(ReflectArgs &a, int64_t n, int roughness, float blur, const MaybeArray &alpha) {
     if (roughness < -1 || roughness >= a.channels) throw std::invalid_argument("roughness: expected a channel, or -1");
     if (roughness >= 0 && !alpha) throw std::invalid_argument("alpha: needed where there is roughness");
@@ -134,7 +134,7 @@ void bind_reflect(nb::module_ &module) {
             if (rotation.size() != 9) throw std::invalid_argument("rotation: expected 9 numbers");
             run(POLARGUIDE_DISPATCH(turn), TurnArgs{rotation.data(), directions.data(), out.data()}, n);
         },
-        nb::arg("directions"), nb::arg("rotation"), nb::arg("out"), "Rows times a rotation.");
+        nb::arg("directions"), nb::arg("rotation"), nb::arg("out"), "Multiply rows by a rotation.");
     module.def(
         "reflect_forward",
         [](const Array &features, const Array &rays, const std::vector<Array> &textures, bool fresnel, bool local,
@@ -150,7 +150,7 @@ void bind_reflect(nb::module_ &module) {
             float *all_directions = optional_rows(directions, "directions", n), *all_seen = optional_rows(seen, "seen", n);
             if (level) expect_shape(*level, "level", {n});
             nb::gil_scoped_release release;
-            // A piece at a time goes through all three, so that what one leaves the next finds near.
+            // Each piece passes through all three steps while it is in the cache.
             const Workers workers;
             std::vector<float> own(size_t(workers.count()) * 8 * item_chunk);
             auto body = [&](int64_t b, int64_t e, int worker) {
@@ -176,7 +176,7 @@ void bind_reflect(nb::module_ &module) {
         nb::arg("index"), nb::arg("roughness"), nb::arg("blur"), nb::arg("alpha").none(), nb::arg("directions").none(),
         nb::arg("level").none(), nb::arg("seen").none(), nb::arg("final"), nb::arg("specular"), nb::arg("diffuse"),
         nb::arg("reflection"),
-        "The layers of the picture; fills mirrored rays, their levels and what the look-up gave, where they are not None.");
+        "Compute the layers of the picture; also mirrored rays, their levels and the light from the look-up, unless None.");
     module.def(
         "reflect_backward_layers",
         [](const Array &features, const Array &rays, const Array &seen, bool fresnel, bool local, float refractive_index,
@@ -203,8 +203,8 @@ void bind_reflect(nb::module_ &module) {
         nb::arg("grad_final").none(), nb::arg("grad_specular").none(), nb::arg("grad_diffuse").none(),
         nb::arg("grad_reflection").none(), nb::arg("grad_held_specular").none(), nb::arg("grad_held_diffuse").none(),
         nb::arg("grad_seen"), nb::arg("grad_texels").none(), nb::arg("grad_features"),
-        "Fills the gradients by the look-up and, but for what comes through the look-up, by the features. What comes by "
-        "the held layers leaves the normals alone: of the two by the look-up it is in grad_texels.");
+        "Compute the gradients of the look-up, and of the features apart from the part through the look-up. Gradients of the "
+        "held layers do not reach the normals: of both gradients of the look-up, only grad_texels includes them.");
     module.def(
         "reflect_backward_directions",
         [](const Array &features, const Array &rays, int roughness, float blur, MaybeArray alpha, const Array &grad_directions,
@@ -221,7 +221,7 @@ void bind_reflect(nb::module_ &module) {
         },
         nb::arg("features"), nb::arg("rays"), nb::arg("roughness"), nb::arg("blur"), nb::arg("alpha").none(),
         nb::arg("grad_directions"), nb::arg("grad_level").none(), nb::arg("grad_features"),
-        "Adds the gradients of normals and roughness that come through the look-up.");
+        "Add the gradients of normals and roughness through the look-up.");
     module.def(
         "gbuffer_split",
         [](const Array &features, const Array &alpha, Array normal, std::optional<Array> depth) {
@@ -234,7 +234,7 @@ void bind_reflect(nb::module_ &module) {
             run(POLARGUIDE_DISPATCH(gbuffer_split), a, n);
         },
         nb::arg("features"), nb::arg("alpha"), nb::arg("normal"), nb::arg("depth").none(),
-        "The blended normal, and the last channel over alpha.");
+        "Compute the blended normal, and the last channel over alpha.");
     module.def(
         "gbuffer_join",
         [](const Array &alpha, MaybeArray depth, MaybeArray grad_features, MaybeArray grad_normal, MaybeArray grad_depth,
@@ -256,5 +256,5 @@ void bind_reflect(nb::module_ &module) {
         },
         nb::arg("alpha"), nb::arg("depth").none(), nb::arg("grad_features").none(), nb::arg("grad_normal").none(),
         nb::arg("grad_depth").none(), nb::arg("to_features"), nb::arg("to_alpha").none(),
-        "Fills the gradients by features and, with a depth's, by alpha.");
+        "Compute the gradients of features and, with a depth, of alpha.");
 }

@@ -34,7 +34,7 @@ double total(const std::vector<double> &parts) {
     return sum;
 }
 
-// Runs a kernel over pixels; the sum of its parts, times the term's factor.
+// Runs a kernel over pixels and returns the sum of its parts times the factor of the term.
 template <class Args> double run(void (*kernel)(const Args &, int64_t, int64_t), Args &a, int64_t count) {
     nb::gil_scoped_release release;
     std::vector<double> parts(size_t((count + pixels_per_part - 1) / pixels_per_part));
@@ -110,11 +110,11 @@ void bind_terms(nb::module_ &module) {
                nb::arg("specular"), nb::arg("diffuse"), nb::arg("metal").none(), nb::arg("measured"), nb::arg("analyzers"),
                nb::arg("weight").none(), nb::arg("factor"), nb::arg("refractive_index"), nb::arg("index").none(), nb::arg("grad_normal"),
                nb::arg("grad_specular"), nb::arg("grad_diffuse"), nb::arg("grad_metal").none(),
-               "Distance of the polarization of two layers from K measurements; adds to grad_normal, fills the others.");
+               "Return the distance of the polarization of two layers from K measurements; add to grad_normal, compute the other gradients.");
     module.def("direction", &direction, nb::arg("normal"), nb::arg("directions"), nb::arg("weight").none(),
                nb::arg("factor"), nb::arg("plane"), nb::arg("grad_normal"),
-               "Distance of normals from directions, or from planes; adds to grad_normal.");
+               "Return the distance of normals from directions or planes; add to grad_normal.");
     module.def("consistency", &consistency, nb::arg("normal"), nb::arg("rays"), nb::arg("rotation"), nb::arg("depth"),
                nb::arg("alpha"), nb::arg("weight").none(), nb::arg("factor"), nb::arg("grad_normal"),
-               nb::arg("grad_depth"), "Distance of normals from those of the depth; adds to grad_normal.");
+               nb::arg("grad_depth"), "Return the distance of normals from normals of the depth; add to grad_normal.");
 }

@@ -18,11 +18,11 @@ void bind_terms(nb::module_ &module);
 NB_MODULE(_native, module) {
     nb::set_leak_warnings(false); // autograd graphs may outlive the interpreter
     module.doc() = "CPU kernels of polarguide.";
-    module.def("thread_count", &polarguide::thread_count, "Number of threads the kernels use.");
+    module.def("thread_count", &polarguide::thread_count, "Return the number of threads of the kernels.");
     module.def("set_thread_count", &polarguide::set_thread_count, nb::arg("threads"),
-               "Use this many threads; 0 restores the default.");
+               "Set the number of threads; 0 restores the default.");
     module.def("simd", [] { return std::string(polarguide::isa_name(polarguide::active_isa())); },
-               "Name of the instruction set in use.");
+               "Return the name of the active instruction set.");
     module.def(
         "select_simd",
         [](const std::string &name) {

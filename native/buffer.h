@@ -4,7 +4,7 @@
 
 namespace polarguide {
 
-// An uninitialized array: pages are touched by the threads that use them.
+// Uninitialized array; its pages are first touched by the threads that use them.
 template <class T> class Buffer {
   public:
     void resize(int64_t count) {

@@ -1,8 +1,8 @@
-// The seamless cubemap: bilinear look-up and its gradients.
+// Seamless cubemap: bilinear look-up and its gradients.
 //
-// A direction is located sixteen at a time; the taps are then read one direction at a time. Cells (the squares between
-// four texel centers) are counted with one ring of texels beyond each face, so that a cell whose column or row is 0 or
-// the resolution has taps on a neighboring face. Those few take the slow way.
+// Sixteen directions are located at a time; taps are then read for each direction. Cells are squares between four texel
+// centers. Their numbers include one ring of texels around each face, so a cell whose column or row is 0 or the resolution
+// has taps on a neighboring face. These few cells use a slower path.
 #include "image.h"
 #include "simd.h"
 
@@ -10,7 +10,7 @@ namespace polarguide {
 namespace POLARGUIDE_ISA {
 namespace {
 
-// OpenGL's faces +x -x +y -y +z -z: which component is s and t, with which sign.
+// Components and signs of s and t for OpenGL's faces +x -x +y -y +z -z.
 constexpr int s_axis[6] = {2, 2, 0, 0, 0, 0}, t_axis[6] = {1, 1, 2, 2, 1, 1};
 constexpr int s_sign[6] = {-1, 1, 1, 1, 1, -1}, t_sign[6] = {-1, -1, 1, -1, -1, -1};
 
@@ -29,7 +29,7 @@ POLARGUIDE_INLINE Resolutions everywhere(int resolution) {
     return r;
 }
 
-// Column (or row) and fraction of a coordinate in [0.5, R + 0.5]; NaN lands in cell 0 and stays in the fraction.
+// Computes column (or row) and fraction of a coordinate in [0.5, R + 0.5]. A NaN has cell 0 and remains in the fraction.
 POLARGUIDE_INLINE void split(reg u, reg resolution, int32_t *cell, float *fraction) {
     const reg low = u > 0.0f ? u : reg{}, inside = low < resolution ? low : resolution;
     const ireg whole = __builtin_convertvector(inside, ireg);
@@ -49,7 +49,7 @@ POLARGUIDE_INLINE void locate(const float *directions, int n, const Resolutions 
         const reg major = on_x ? x : on_y ? y : z, size = on_x ? ax : on_y ? ay : az;
         const ireg negative = major < 0.0f;
         const reg flipped_x = negative ? -x : x, flipped_z = negative ? -z : z;
-        const reg inverse = size <= 1e-20f ? reg{} : 1.0f / size; // no direction: the center of +x, without a gradient
+        const reg inverse = size <= 1e-20f ? reg{} : 1.0f / size; // zero direction: the center of +x, without a gradient
         const reg s = (on_x ? -flipped_z : on_y ? x : flipped_x) * inverse, t = (on_y ? flipped_z : -y) * inverse;
         const ireg face = (on_y & 2) | (on_z & 4) | (negative & 1);
         for (int l = 0; l < reg_lanes; ++l) cells->face[b + l] = face[l];
@@ -59,14 +59,14 @@ POLARGUIDE_INLINE void locate(const float *directions, int n, const Resolutions 
     }
 }
 
-// The texels that a tap stands for: one, or at a corner of the cube the three that meet there, averaged.
+// Texels of a tap: one, or at a corner of the cube the mean of the three that meet there.
 struct Tap {
     int count;
     int64_t texel[3];
 };
 
-// The texel of the neighboring face next to (column, row), one of which is one step off `face`. Positions on the cube
-// are counted in half texels from its center: a face lies at +-R, its texels' centers at -(R - 1) .. R - 1.
+// Returns the texel of the neighboring face next to (column, row), one of which is one step outside `face`. Positions are in
+// half texels from the center of the cube: a face lies at +-R, its texel centers at -(R - 1) .. R - 1.
 POLARGUIDE_INLINE int64_t across(int face, int column, int row, int resolution) {
     const int last = resolution - 1, axis = face / 2;
     int p[3];
@@ -87,13 +87,13 @@ Tap tap_at(int face, int column, int row, int resolution) {
     return {3, {own, across(face, column, inner_row, resolution), across(face, inner_column, row, resolution)}};
 }
 
-// One cubemap: a texture [6,R,R,C].
+// Cubemap: a texture [6,R,R,C].
 struct Texture {
     int resolution, channels;
     const float *texels;
 };
 
-// The four taps of cell l.
+// Returns the four taps of cell l.
 POLARGUIDE_INLINE void taps_of(int resolution, const Cells &cells, int l, Tap *taps) {
     for (int k = 0; k < 4; ++k)
         taps[k] = tap_at(cells.face[l], cells.u[l] - 1 + k % 2, cells.v[l] - 1 + k / 2, resolution);
@@ -113,7 +113,7 @@ POLARGUIDE_INLINE int64_t first_texel(int resolution, const Cells &cells, int l)
     return (int64_t(cells.face[l]) * resolution + cells.v[l] - 1) * resolution + cells.u[l] - 1;
 }
 
-// What cell l sees. C channels; 0: any number of them.
+// Interpolates in cell l. C channels; 0: any number.
 template <int C> POLARGUIDE_INLINE void look_up(const Texture &a, const Cells &cells, int l, float *out) {
     const int channels = C ? C : a.channels;
     const float fu = cells.fu[l], fv = cells.fv[l];
@@ -135,7 +135,7 @@ template <int C> POLARGUIDE_INLINE void look_up(const Texture &a, const Cells &c
     }
 }
 
-// The gradient [3] by the direction of cell l of what it sees, given that by its channels.
+// Computes the gradient [3] of the direction in cell l from the gradient of its channels.
 template <int C>
 POLARGUIDE_INLINE void by_direction(const Texture &a, const Cells &cells, int l, const float *g, float *out) {
     const int channels = C ? C : a.channels;
@@ -162,7 +162,7 @@ POLARGUIDE_INLINE void by_direction(const Texture &a, const Cells &cells, int l,
     out[axis] = face % 2 ? -by_major : by_major;
 }
 
-// Adds to the texels' gradient what comes by cell l.
+// Adds the contribution of cell l to the gradient of the texels.
 template <int C>
 POLARGUIDE_INLINE void by_texels(int resolution, int all, const Cells &cells, int l, const float *g, float *sums) {
     const int channels = C ? C : all;
@@ -220,11 +220,11 @@ template <int C> void backward_texture(const CubemapArgs &a, int64_t begin, int6
     }
 }
 
-// Where sixteen directions lie between mip levels, and in the two nearest.
+// Positions of sixteen directions between mip levels and within the two nearest levels.
 struct Between {
     int lower[lanes], upper[lanes];
     float fraction[lanes];
-    bool inside[lanes]; // not beyond the ends
+    bool inside[lanes]; // within the range of levels
     Cells below, above;
 };
 

@@ -11,7 +11,7 @@ namespace polarguide {
 namespace {
 
 #if defined(_WIN32) && defined(POLARGUIDE_X86)
-// Clang's __builtin_cpu_supports needs a library that Microsoft's linker does not find. Bits of CPUID's leaves 1 and 7.
+// Clang's __builtin_cpu_supports needs a library that Microsoft's linker does not find, so bits of CPUID's leaves 1 and 7 are read.
 __attribute__((target("xsave"))) bool available(Isa isa) {
     if (isa == Isa::baseline) return true;
     int one[4], seven[4];
@@ -24,7 +24,7 @@ __attribute__((target("xsave"))) bool available(Isa isa) {
         return true;
     };
     if (!all(c, {12, 27, 28})) return false; // FMA, OSXSAVE, AVX
-    const unsigned saved = unsigned(_xgetbv(0)); // the registers that the system keeps for a process
+    const unsigned saved = unsigned(_xgetbv(0)); // registers that the system saves for a process
     if (isa == Isa::avx2) return all(saved, {1, 2}) && all(b, {3, 5, 8}); // BMI1, AVX2, BMI2
     return all(saved, {1, 2, 5, 6, 7}) && all(b, {16, 17, 28, 30, 31}); // AVX-512 F, DQ, CD, BW, VL
 }

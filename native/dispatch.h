@@ -1,4 +1,4 @@
-// Which instruction set the kernels run with: the best the processor has, or POLARGUIDE_SIMD=baseline|avx2|avx512.
+// Instruction set of the kernels: the best one of the processor, or POLARGUIDE_SIMD=baseline|avx2|avx512.
 #pragma once
 
 namespace polarguide {
@@ -6,7 +6,7 @@ namespace polarguide {
 enum class Isa { baseline, avx2, avx512 };
 Isa active_isa();
 const char *isa_name(Isa isa);
-// Chooses by name ("auto", "baseline", "avx2", "avx512"); false when this processor or build lacks it.
+// Selects by name ("auto", "baseline", "avx2", "avx512"); false if the processor or the build lacks it.
 bool select_isa(const char *name);
 
 } // namespace polarguide

@@ -12,7 +12,7 @@ constexpr float sh0 = 0.28209479f, sh1 = 0.48860251f;
 constexpr float sh2[5] = {1.09254843f, -1.09254843f, 0.31539157f, -1.09254843f, 0.54627422f};
 constexpr float sh3[7] = {-0.59004359f, 2.89061144f, -0.45704580f, 0.37317633f, -0.45704580f, 1.44530572f, -0.59004359f};
 
-// Where a degree's columns of `rest` are read and written: tiles of sixteen that may overlap but stay within the row.
+// Columns of `rest` that a degree reads and writes: tiles of sixteen, which may overlap but stay within the row.
 template <int D> struct Columns;
 template <> struct Columns<0> {
     static constexpr int used = 0, tiles = 0, first[1] = {0};
@@ -41,7 +41,7 @@ template <int D> POLARGUIDE_INLINE void basis(vf x, vf y, vf z, vf *b) {
     b[13] = z * (xx - yy) * sh3[5], b[14] = x * (xx - yy * 3.0f) * sh3[6];
 }
 
-// Gradient with respect to the direction of sum_k s[k] * basis_k.
+// Computes the gradient of sum_k s[k] * basis_k with respect to the direction.
 template <int D> POLARGUIDE_INLINE void basis_gradient(vf x, vf y, vf z, const vf *s, vf *g) {
     g[0] = s[2] * -sh1, g[1] = s[0] * -sh1, g[2] = s[1] * sh1;
     if (D < 2) return;
@@ -60,14 +60,14 @@ template <int D> POLARGUIDE_INLINE void basis_gradient(vf x, vf y, vf z, const v
     g[2] += xy * s9 + yz * s10 * 8.0f + (zz * 2.0f - xx - yy) * s11 + xz * s12 * 8.0f + (xx - yy) * s13;
 }
 
-// Asks for the rows of `rest` two blocks of sixteen ahead (1: to write them): transposed, a block's 45 cache lines are
-// wanted at once, which the processor does not foresee by itself.
+// Prefetches the rows of `rest` two blocks of sixteen ahead (1: for writing). A transposition needs the 45 cache lines of a
+// block at once, which the processor does not predict.
 template <int Write> POLARGUIDE_INLINE void ask_ahead(const float *rest) {
     constexpr int block = lanes * rest_values;
     for (int i = 2 * block; i < 3 * block; i += 16) __builtin_prefetch(rest + i, Write);
 }
 
-// The used columns of sixteen rows of `rest` as vectors, and back. `spare` holds sixteen rows for a last, short block.
+// Transposes the used columns of sixteen rows of `rest` to vectors and back. `spare` has sixteen rows for a last, short block.
 template <int D> POLARGUIDE_INLINE void load_rest(const float *rest, int n, float *spare, float *columns) {
     if (n < lanes) {
         for (int i = 0; i < n * rest_values; ++i) spare[i] = rest[i];
@@ -96,7 +96,7 @@ template <int D> POLARGUIDE_INLINE void store_rest(float *rest, int n, bool stre
         for (int i = 0; i < lanes * rest_values; i += lanes) stream(rest + i, load(spare + i));
 }
 
-// Unit directions from the center; a Gaussian at the center has direction zero. Returns 1 / distance.
+// Computes unit directions from the center, zero for a Gaussian at the center. Returns 1 / distance.
 POLARGUIDE_INLINE vf directions(const HarmonicsArgs &a, int64_t first, int n, vf *d) {
     load_columns<3>(a.means + 3 * first, n, d);
     for (int i = 0; i < 3; ++i) d[i] -= a.center[i];

@@ -1,7 +1,7 @@
-// The photometric loss: sRGB, L1 and SSIM of a picture, and the gradient with respect to the linear prediction.
+// Photometric loss: sRGB, L1 and SSIM of a picture, and the gradient with respect to the linear prediction.
 //
-// Rows stay interleaved (red, green, blue, red, ...): a horizontal tap is three floats away. SSIM needs four blurred
-// moments, x, y, xx + yy and xy; a row's vertical blur forms the products on the way, so no picture of them is kept.
+// Rows are interleaved (red, green, blue, red, ...), so a horizontal tap is three floats away. SSIM needs the blurred moments
+// x, y, xx + yy and xy. The vertical blur of a row computes the products, so no picture of them is stored.
 #include "image.h"
 #include "simd.h"
 
@@ -14,10 +14,10 @@ namespace {
 constexpr int reach = 5, taps = 11, moments = 4, colors = 3;
 constexpr float tap[taps] = {0.00102838f, 0.00759876f, 0.03600077f, 0.10936069f, 0.21300554f, 0.26601172f,
                              0.21300554f, 0.10936069f, 0.03600077f, 0.00759876f, 0.00102838f};
-constexpr float c1 = 0.0001f, c2 = 0.0009f; // (0.01)^2 and (0.03)^2, of a range of 1
+constexpr float c1 = 0.0001f, c2 = 0.0009f; // (0.01)^2 and (0.03)^2 for a range of 1
 constexpr float knee = 0.0031308f;          // sRGB is linear below
 
-// sRGB of the clipped value: exactly 1 where saturated, so that a saturated target is met. NaN stays NaN.
+// sRGB of the clipped value, exactly 1 for saturated values, so that the loss of a saturated target is 0. NaN stays NaN.
 POLARGUIDE_INLINE reg show(reg x) {
     const reg u = clamp(x, reg{}, reg_splat(1.0f));
     const reg curved = exp2(log2(max(u, reg_splat(knee))) * (1.0f / 2.4f)) * 1.055f - 0.055f;
@@ -25,13 +25,13 @@ POLARGUIDE_INLINE reg show(reg x) {
     return x != x ? x : value;
 }
 
-// Slope of sRGB at the clipped value, given its sRGB.
+// Slope of sRGB at the clipped value, computed from its sRGB.
 POLARGUIDE_INLINE reg slope_of(reg x, reg shown) {
     const reg u = clamp(x, reg{}, reg_splat(1.0f));
     return u <= knee ? reg_splat(12.92f) : (shown + 0.055f) * reciprocal(max(u, reg_splat(knee)) * 2.4f);
 }
 
-// The last vector of a row may be short; the missing reg_lanes are zero.
+// The last vector of a row may be short; missing lanes are zero.
 POLARGUIDE_INLINE reg load_some(const float *p, int64_t n) {
     if (n >= reg_lanes) return reg_load(p);
     alignas(64) float t[reg_lanes] = {};
@@ -51,14 +51,14 @@ POLARGUIDE_INLINE double sum_of(reg x) {
     return sum;
 }
 
-// The weights of row y, once per color; zero in the padding.
+// Weights of row y, repeated for each color; zero in the padding.
 POLARGUIDE_INLINE void spread_weights(const PhotometricArgs &a, int64_t y, float *line) {
     for (int x = 0; x < a.width; ++x)
         for (int c = 0; c < colors; ++c) line[colors * x + c] = a.weight ? a.weight[y * a.width + x] : 1.0f;
     for (int64_t x = int64_t(colors) * a.width; x < a.stride; ++x) line[x] = 0.0f;
 }
 
-// A worker's scratch: lines with room for the taps on both sides, which stays zero.
+// Scratch of a worker: lines with a margin of zeros for the taps on both sides.
 struct Lines {
     float *line[moments], *blurred[moments], *weight;
 };
@@ -75,7 +75,7 @@ POLARGUIDE_INLINE Lines lay_out(const PhotometricArgs &a, float *scratch) {
     return l;
 }
 
-// The window's rows that lie in the picture: y - reach + first .. y - reach + last.
+// Rows of the window within the picture: y - reach + first .. y - reach + last.
 struct Window {
     int first, last;
 };
@@ -154,7 +154,7 @@ void photometric_statistics(const PhotometricArgs &a, int64_t begin, int64_t end
             const reg inverse = reciprocal(b1 * b2), s = a1 * a2 * inverse;
             const reg by_xy = a1 * inverse * 2.0f, by_xx = -s * b1 * inverse; // -s / b2
             const reg by_mean = (my * (a2 - a1) * inverse - s * mx * b2 * inverse - by_xx * mx) * 2.0f;
-            const auto left_out = weight == 0.0f; // also keeps a NaN out of the padding
+            const auto left_out = weight == 0.0f; // also prevents NaN in the padding
             sum += left_out ? reg{} : s * weight;
             if (!a.gradient) continue;
             const int64_t at = y * a.stride + x;
@@ -180,7 +180,7 @@ void photometric_gradient(const PhotometricArgs &a, int64_t begin, int64_t end, 
             const reg spread = reg_load(l.blurred[0] + x) + shown * reg_load(l.blurred[1] + x) * 2.0f + goal * reg_load(l.blurred[2] + x);
             const reg g = pull * reg_load(l.weight + x) + spread * for_ssim;
             const reg p = load_some(a.prediction + y * used + x, used - x);
-            // Beyond [0, 1] only a gradient that brings the value back passes.
+            // Outside [0, 1] only a gradient toward the range passes.
             const auto stuck = ((p < 0.0f) & (g > 0.0f)) | ((p > 1.0f) & (g < 0.0f));
             store_some(a.gradient + y * used + x, used - x, stuck ? reg{} : g * slope_of(p, shown));
         }

@@ -1,10 +1,10 @@
-// The table of functions that each instruction set provides. Plain pointers only: see CMakeLists.txt.
+// Table of functions of each instruction set. Arguments are plain pointers, see CMakeLists.txt.
 #pragma once
 #include "dispatch.h"
 
 namespace polarguide {
 
-// Declares `name` in the namespace of every instruction set this build has, and picks the active one at run time.
+// Declares `name` in the namespace of each instruction set of this build; the active one is selected at run time.
 #if defined(POLARGUIDE_X86)
 #define POLARGUIDE_DISPATCH(name)                                                                                      \
     (::polarguide::active_isa() == ::polarguide::Isa::avx512 ? ::polarguide::avx512::name                              \

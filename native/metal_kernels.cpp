@@ -1,5 +1,5 @@
-// What metals reflect at the pixels that show them (shading.metal), added to the layers of dielectrics, and its gradient.
-// Fresnel's equations of a conductor (optics.conductor) are differentiated forward, by the cosine and the reflectance.
+// Reflection of metals (shading.metal), added to the layers of dielectrics, and its gradient. Fresnel's equations of a
+// conductor (optics.conductor) have forward derivatives with respect to the cosine and the reflectance.
 #include "image.h"
 #include "mirror.h"
 
@@ -9,7 +9,7 @@ namespace {
 
 constexpr float least_reflectance = 0.1f, largest_reflectance = 0.985f;
 
-// A value and its derivatives by the cosine and by the reflectance.
+// Value with its derivatives with respect to the cosine and the reflectance.
 struct Dual {
     reg v, c, r;
 };
@@ -54,7 +54,7 @@ POLARGUIDE_INLINE Conductor conductor(reg cosine, reg reflectance) {
     return {0.5f * (s + s * ((x - across) / (x + across))), y / x};
 }
 
-// Columns `first` to `first` + W at some pixels; rows from n on are zero.
+// Loads columns `first` to `first` + W of some pixels; rows from n on are zero.
 template <int W> POLARGUIDE_INLINE void gather(const float *rows, int stride, int first, const int64_t *at, int n, reg *columns) {
     alignas(64) float t[W][reg_lanes] = {};
     for (int l = 0; l < n; ++l)
@@ -66,10 +66,10 @@ template <int W> POLARGUIDE_INLINE void add(const reg *columns, const int64_t *a
         for (int k = 0; k < W; ++k) rows[stride * at[l] + first + k] += columns[k][l];
 }
 
-// Of some pixels from the i-th on.
+// Inputs of some pixels, starting at the i-th.
 struct Metal {
-    reg share, inverse, given[3], reflectance[3], light[3]; // `given` as blended, reflectance without the share
-    ireg shows;                                             // not under the least share
+    reg share, inverse, given[3], reflectance[3], light[3]; // `given`: blended values; reflectance: divided by the share
+    ireg shows;                                             // at least the least share
     Mirror mirror;
 };
 
@@ -104,7 +104,7 @@ void metal_layers(const MetalArgs &a, int64_t begin, int64_t end) {
     }
 }
 
-// Gradients by the light, to which they are added, and by the normal, the reflectance and the share as they are blended.
+// Adds the gradient of the light, and computes those of the blended normal, reflectance and share.
 void metal_backward(const MetalArgs &a, int64_t begin, int64_t end) {
     for (int64_t i = begin; i < end; i += reg_lanes) {
         const int n = count_at(i, end);

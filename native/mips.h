@@ -1,4 +1,4 @@
-// Mip levels of a cubemap as the bindings take them.
+// Mip levels of a cubemap as arguments of the bindings.
 #pragma once
 #include "arrays.h"
 #include "image.h"
@@ -7,7 +7,7 @@
 
 namespace polarguide {
 
-// The textures of a look-up between levels; raises ValueError unless they fit together.
+// Returns the textures of a look-up between levels; raises ValueError unless their shapes fit.
 inline MipArgs mip_args(const std::vector<Array> &textures) {
     MipArgs a{};
     if (textures.empty() || textures.size() > most_mip_levels)

@@ -1,4 +1,4 @@
-// Rays mirrored at blended normals, and the way back.
+// Rays mirrored at blended normals, and their gradient.
 #pragma once
 #include "simd.h"
 
@@ -8,10 +8,10 @@ namespace {
 
 constexpr float shortest_normal = 1e-3f;
 
-// The blended normals of some pixels, and the rays there.
+// Blended normals and rays of some pixels.
 struct Mirror {
     reg ray[3], normal[3], inverse; // unit, and 1 / length
-    ireg short_;                    // length below the floor: divided by the floor
+    ireg short_;                    // length below the floor, which then is the divisor
     reg along;                      // ray . normal
 };
 
@@ -32,13 +32,13 @@ POLARGUIDE_INLINE void mirrored_ray(const Mirror &m, reg *out) {
     for (int k = 0; k < 3; ++k) out[k] = m.ray[k] - 2.0f * m.along * m.normal[k];
 }
 
-// Of a gradient by `along`, what goes to the blended normal.
+// Computes the gradient of the blended normal from the gradient of `along`.
 POLARGUIDE_INLINE void normal_by_along(const Mirror &m, reg by_along, reg *to) {
     for (int k = 0; k < 3; ++k)
         to[k] = by_along * m.inverse * (m.ray[k] - (m.short_ ? reg{} : m.along * m.normal[k]));
 }
 
-// Of a gradient by the mirrored ray, what goes to the blended normal.
+// Computes the gradient of the blended normal from the gradient of the mirrored ray.
 POLARGUIDE_INLINE void normal_by_mirrored(const Mirror &m, const reg *g, reg *to) {
     reg by_unit[3], radial = {};
     const reg across = g[0] * m.normal[0] + g[1] * m.normal[1] + g[2] * m.normal[2];

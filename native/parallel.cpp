@@ -22,7 +22,7 @@
 #endif
 
 #if defined(__linux__) && defined(__GLIBCXX__)
-// libstdc++ 12 has this function in two versions; the older one, which does the same, is on older systems, too.
+// libstdc++ 12 has two equivalent versions of this function; older systems have the older one.
 __asm__(".symver _ZNSt18condition_variable4waitERSt11unique_lockISt5mutexE, "
         "_ZNSt18condition_variable4waitERSt11unique_lockISt5mutexE@GLIBCXX_3.4.11");
 #endif
@@ -54,9 +54,9 @@ class Pool {
         try {
             for (int worker = 1; worker < threads; ++worker)
                 workers_.emplace_back([this, worker] { serve(worker); });
-        } catch (const std::system_error &) { // those that have begun must be joined, or the process ends
+        } catch (const std::system_error &) { // started threads must be joined, otherwise the process ends
             stop();
-            throw std::runtime_error("can't start new thread"); // as Python says it
+            throw std::runtime_error("can't start new thread"); // Python's message
         } catch (...) {
             stop();
             throw;
@@ -78,7 +78,7 @@ class Pool {
         start_.notify_all();
         work(0);
         std::exception_ptr error;
-        { // Whatever was thrown: `context` must outlive all workers.
+        { // After any exception: `context` must outlive all workers.
             std::unique_lock<std::mutex> lock(mutex_);
             done_.wait(lock, [this] { return pending_ == 0; });
             std::swap(error, error_);
@@ -98,7 +98,7 @@ class Pool {
         } catch (...) {
             std::lock_guard<std::mutex> lock(mutex_);
             if (!error_) error_ = std::current_exception();
-            next_.store(count_, std::memory_order_relaxed); // the others need not begin what nobody will read
+            next_.store(count_, std::memory_order_relaxed); // the other workers skip the remaining ranges
         }
     }
     void stop() {
@@ -133,7 +133,7 @@ class Pool {
     int64_t count_ = 0, chunk_ = 1;
     Body body_ = nullptr;
     void *context_ = nullptr;
-    std::exception_ptr error_; // the first of a job
+    std::exception_ptr error_; // first exception of a job
     int pending_ = 0;
     uint64_t generation_ = 0;
     bool stopping_ = false;
@@ -147,7 +147,7 @@ int requested = 0;
 
 std::shared_ptr<Pool> current_pool() {
     std::lock_guard<std::mutex> lock(pool_mutex);
-    if (pool && pool->forked()) new std::shared_ptr<Pool>(std::move(pool)); // its threads live in the parent: leak it
+    if (pool && pool->forked()) new std::shared_ptr<Pool>(std::move(pool)); // its threads belong to the parent process, so it is leaked
     if (!pool) pool = std::make_shared<Pool>(requested > 0 ? requested : default_threads());
     return pool;
 }

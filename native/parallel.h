@@ -1,5 +1,5 @@
-// A small thread pool with passive waits: idle workers sleep, so two processes on one machine do not
-// fight for cores by spinning. Work is cut in fixed chunks; results never depend on the number of threads.
+// Thread pool with passive waits: idle workers sleep, so two processes on one machine do not compete for cores by spinning.
+// Work is divided into fixed chunks, so results do not depend on the number of threads.
 #pragma once
 #include <memory>
 #include <stdint.h>
@@ -8,16 +8,16 @@ namespace polarguide {
 
 class Pool;
 
-// The threads that some work is done by. They stay the same for as long as this lives, whatever others set meanwhile: memory
-// for each worker is sized by the `count` of the very threads that it is for.
+// Threads of some work. Their number is fixed during the lifetime of this object, even if another thread changes the setting,
+// so that memory for each worker has the size for `count` threads.
 class Workers {
   public:
-    Workers(); // those that are set now
+    Workers(); // with the current number of threads
     int count() const;
 
-    // f(begin, end, worker) is called for disjoint [begin, end) ranges that cover [0, count), each at most `chunk` long.
-    // `worker` is in [0, count()). Returns when all of them are done. The first exception that one throws is thrown here
-    // after all workers have stopped; ranges that nobody has begun by then are left out.
+    // Calls f(begin, end, worker) for disjoint ranges [begin, end) that cover [0, count), each at most `chunk` long. `worker` is in
+    // [0, count()). Returns when all ranges are done. After an exception, the remaining ranges are skipped, and the first exception
+    // is rethrown when all workers have stopped.
     template <class F> void chunks(int64_t count, int64_t chunk, F &f) const {
         run(count, chunk, [](void *c, int64_t b, int64_t e, int w) { (*static_cast<F *>(c))(b, e, w); }, &f);
     }
@@ -30,9 +30,9 @@ class Workers {
 };
 
 int thread_count();
-void set_thread_count(int threads); // at least 1; 0 restores the default (POLARGUIDE_THREADS, else the cores we may use)
+void set_thread_count(int threads); // at least 1; 0 restores the default (POLARGUIDE_THREADS, else the available cores)
 
-// For work that needs no memory for each worker.
+// For work without memory per worker.
 template <class F> inline void parallel_chunks(int64_t count, int64_t chunk, F &f) { Workers().chunks(count, chunk, f); }
 
 } // namespace polarguide

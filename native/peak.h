@@ -1,4 +1,4 @@
-// Where the exponent of a Gaussian on the screen is largest.
+// Maximum of the exponent of a Gaussian on the screen.
 #pragma once
 #include "simd.h"
 
@@ -8,8 +8,9 @@ namespace {
 
 constexpr float log2_minimum = -7.99435344f; // log2(1 / 255)
 
-// The largest log2(alpha) over rectangles whose sides x0 to x1 and y0 to y1 are relative to the center of a Gaussian: as it
-// is concave, on one of the two sides that face the center. `row` is as `screen` of ProjectArgs, `to_y` and `to_x` are its last two.
+// Maximum of log2(alpha) over rectangles with sides x0 to x1 and y0 to y1 relative to the center of a Gaussian. It is concave, so
+// the maximum lies on one of the two sides that face the center. `row` is a row of `screen` in ProjectArgs, and `to_y` and `to_x`
+// are its last two values.
 POLARGUIDE_INLINE reg peak_inside(const float *row, float to_y, float to_x, reg x0, reg x1, reg y0, reg y1) {
     const reg cx = clamp(reg{}, x0, x1), cy = clamp(reg{}, y0, y1);
     const reg ey = clamp(cx * to_y, y0, y1), ex = clamp(cy * to_x, x0, x1);

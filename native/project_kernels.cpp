@@ -1,4 +1,4 @@
-// EWA projection of the Gaussians, the tiles they touch, and the gradients of both.
+// EWA projection of Gaussians, the tiles that they touch, and the gradients of the projection.
 #include "peak.h"
 #include "raster.h"
 
@@ -12,27 +12,27 @@ constexpr float blur = 0.1f; // px^2, added to the projected covariance
 constexpr float natural = 0.693147181f;
 constexpr float minimum_opacity = 1.0f / 255.0f;
 
-// A Gaussian's tiles are looked at in groups, four side by side and as many rows of them as fill a register.
+// Tiles of a Gaussian are examined in groups: four columns and as many rows as fill a register.
 constexpr int group_columns = 4, group_rows = reg_lanes / group_columns;
 alignas(64) const float lane_column[16] = {0, 16, 32, 48, 0, 16, 32, 48, 0, 16, 32, 48, 0, 16, 32, 48};
 alignas(64) const float lane_row[16] = {0, 0, 0, 0, 16, 16, 16, 16, 32, 32, 32, 32, 48, 48, 48, 48};
 static_assert(tile_size == 16, "lane_column and lane_row say where a group's tiles begin");
 
-// The lowest and the highest bit of a group's row. Of an empty one they are farther off than any column, and the wrong way.
+// Lowest and highest bit of a row of a group. For an empty row they are outside all columns, in reverse order.
 constexpr int none = 1 << 20;
 const int lowest[16] = {none, 0, 1, 0, 2, 0, 1, 0, 3, 0, 1, 0, 2, 0, 1, 0};
 const int highest[16] = {-none, 0, 1, 1, 2, 2, 2, 2, 3, 3, 3, 3, 3, 3, 3, 3};
 
-// All that the forward and the backward projection share, of as many Gaussians as a register has lanes. What a culled
-// one's lane holds has no meaning.
+// Values common to the forward and the backward projection, one Gaussian per lane of a register. Lanes of culled Gaussians
+// are undefined.
 struct Projection {
-    ireg valid;             // before the near plane and opaque enough
+    ireg valid;             // in front of the near plane and opaque enough
     reg t[3], opacity;          // camera-space mean
-    reg tx, ty;                 // its x and y, clamped for the Jacobian as far as the picture's surroundings reach
+    reg tx, ty;                 // its x and y, clamped for the Jacobian to the surroundings of the picture
     ireg clamped_x, clamped_y;
-    reg q[4], norm;             // unit quaternion (w, x, y, z), and the length it had
+    reg q[4], norm;             // unit quaternion (w, x, y, z), and its length before
     reg s[3];
-    reg w[9];                   // camera rotation times that of the Gaussian
+    reg w[9];                   // camera rotation times the rotation of the Gaussian
     reg v[9];                   // camera-space covariance
     reg j[4];                   // Jacobian: j0 = fx/z, j1 = -fx tx/z^2, j2 = fy/z, j3 = -fy ty/z^2
     reg a, b, c;                // 2D covariance with the blur
@@ -44,7 +44,7 @@ POLARGUIDE_INLINE reg limited(reg x, float low, float high, ireg *clamped) {
     return clamp(x, reg_splat(low), reg_splat(high));
 }
 
-// Gaussians g to g + n, n at most a register's lanes.
+// Gaussians g to g + n, at most one per lane.
 POLARGUIDE_INLINE void project_some(const ProjectArgs &p, int64_t g, int n, Projection *o) {
     const PinholeCamera &cam = p.camera;
     const float *R = cam.rotation;
@@ -80,17 +80,17 @@ POLARGUIDE_INLINE void project_some(const ProjectArgs &p, int64_t g, int n, Proj
     o->tx = u * z, o->ty = h * z;
     o->j[0] = cam.fx * rz, o->j[1] = -cam.fx * u * rz, o->j[2] = cam.fy * rz, o->j[3] = -cam.fy * h * rz;
     const reg *j = o->j;
-    reg p0[3], p1[3]; // rows of J e, whose products are the covariance
+    reg p0[3], p1[3]; // rows of J e; their products are the covariance
     for (int c = 0; c < 3; ++c) p0[c] = j[0] * e[c] + j[1] * e[6 + c], p1[c] = j[2] * e[3 + c] + j[3] * e[6 + c];
     const reg a = p0[0] * p0[0] + p0[1] * p0[1] + p0[2] * p0[2], c = p1[0] * p1[0] + p1[1] * p1[1] + p1[2] * p1[2];
     o->a = a + blur, o->c = c + blur;
     o->b = p0[0] * p1[0] + p0[1] * p1[1] + p0[2] * p1[2];
-    // a c - b^2 would cancel for needles: a sum of squared minors does not.
+    // a c - b^2 cancels for needles; a sum of squared minors does not.
     const reg m0 = p0[1] * p1[2] - p0[2] * p1[1], m1 = p0[2] * p1[0] - p0[0] * p1[2], m2 = p0[0] * p1[1] - p0[1] * p1[0];
     o->determinant = m0 * m0 + m1 * m1 + m2 * m2 + blur * (a + c) + blur * blur;
 }
 
-// What the picture needs of each of them.
+// Writes the values that the picture needs.
 struct Shown {
     alignas(64) float screen[screen_values][reg_lanes], half_x[reg_lanes], half_y[reg_lanes], radius[reg_lanes], depth[reg_lanes];
     alignas(64) int32_t kept[reg_lanes];
@@ -170,7 +170,7 @@ void emit_tiles(const TileEmitArgs &args, int64_t begin, int64_t end) {
                 }
             }
             for (int r = 0; r < rows; ++r) {
-                if (first[r] > last[r]) continue; // tiles between count even where rounding says no: no block is touched there
+                if (first[r] > last[r]) continue; // tiles between count even if rounding excludes them; none of their blocks is touched
                 runs[count++] = {uint16_t(ty + r), uint16_t(first[r]), uint16_t(last[r] + 1)};
                 touched += last[r] + 1 - first[r];
             }
@@ -181,7 +181,7 @@ void emit_tiles(const TileEmitArgs &args, int64_t begin, int64_t end) {
 
 namespace {
 
-// From gradients of the 2D mean and conic to those of the 3D mean, quaternion and scales.
+// Computes gradients of the 3D mean, quaternion and scales from gradients of the 2D mean and conic.
 POLARGUIDE_INLINE void project_some_backward(const PinholeCamera &cam, const Projection &o, const reg *grad, reg *mean,
                                              reg *quaternion, reg *scale) {
     // conic = inverse of [[a, b], [b, c]]: gradient of the covariance is -conic G conic.
@@ -209,7 +209,7 @@ POLARGUIDE_INLINE void project_some_backward(const PinholeCamera &cam, const Pro
     reg dt[3];
     dt[0] = cam.fx * rz * grad[0], dt[1] = cam.fy * rz * grad[1];
     dt[2] = -(cam.fx * o.t[0] * grad[0] + cam.fy * o.t[1] * grad[1]) * rz2;
-    // j0 = fx/z; j1 = -fx tx/z^2 where tx = x, or z times a constant where clamped.
+    // j0 = fx/z; j1 = -fx tx/z^2 with tx = x, or z times a constant if clamped.
     dt[2] -= rz2 * (cam.fx * dj0 + cam.fy * dj2);
     const reg by_x = cam.fx * rz2 * dj1, by_y = cam.fy * rz2 * dj3;
     const reg along_x = o.tx * rz * by_x, along_y = o.ty * rz * by_y;
@@ -241,12 +241,12 @@ POLARGUIDE_INLINE void project_some_backward(const PinholeCamera &cam, const Pro
     for (int i = 0; i < 4; ++i) quaternion[i] = (dq[i] - along * o.q[i]) * unit;
 }
 
-// Sums the rows of one Gaussian's instances and writes what does not depend on its projection; false where it has none.
-// `sum` then holds, behind the features, the gradients of the 2D mean and conic.
+// Sums the rows of one Gaussian's instances and writes gradients that do not depend on the projection; false without
+// instances. After the features, `sum` holds the gradients of the 2D mean and conic.
 POLARGUIDE_INLINE bool sum_instances(const ProjectBackwardArgs &args, int64_t g, float *sum) {
     const int d = args.channels, real = args.channels_real, stride = d + instance_extra;
     const int64_t first = args.instance_begin[g], last = args.instance_begin[g + 1];
-    for (int i = 0; i < stride; i += lanes) { // rows have room for a whole vector behind the last
+    for (int i = 0; i < stride; i += lanes) { // rows have space for a whole vector after the last value
         vf total = {};
         for (int64_t n = first; n < last; ++n) total += load(args.grad_instances + n * stride + i);
         store(sum + i, total);

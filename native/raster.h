@@ -1,8 +1,8 @@
-// Splatting of 3D Gaussians with D feature channels: the data that passes between the stages.
+// Splatting of 3D Gaussians with D feature channels: data between the stages.
 //
-// Definition (as of the reference implementation, src/polarguide/raster/reference.py): EWA projection with a 0.1 px^2
-// blur, alpha = min(0.99, opacity * exp(-quadratic / 2)), contributions below 1/255 are dropped, a pixel ends before
-// the Gaussian that would bring its transmittance under 1e-4, Gaussians in order of camera depth (ties: by index).
+// Definition, the same as in the reference implementation (src/polarguide/raster/reference.py): EWA projection with a blur of
+// 0.1 px^2, alpha = min(0.99, opacity * exp(-quadratic / 2)), Gaussians in order of camera depth (ties by index). Contributions
+// below 1/255 are dropped. A pixel ends before the Gaussian that would reduce its transmittance below 1e-4.
 #pragma once
 #include "kernels.h"
 
@@ -12,8 +12,8 @@ namespace polarguide {
 
 constexpr int tile_size = 16;   // pixels; a tile is 4 x 4 blocks of 4 x 4 pixels, and one block is one vector
 constexpr int max_channels = 32;
-constexpr int screen_values = 8; // per Gaussian: x, y, the exponent's factors, and where it peaks (see ProjectArgs)
-constexpr int instance_extra = 8; // per instance, behind the D feature gradients: x y, conic a b c, opacity, statistic x y
+constexpr int screen_values = 8; // per Gaussian: x, y, factors of the exponent, and slopes to its maximum (see ProjectArgs)
+constexpr int instance_extra = 8; // per instance, after the D feature gradients: x y, conic a b c, opacity, statistic x y
 
 struct PinholeCamera {
     float rotation[9], translation[3]; // world to camera, row-major
@@ -26,26 +26,26 @@ struct ProjectArgs {
     int64_t count;
     const float *means, *quaternions, *scales, *opacities; // [N,3] [N,4] [N,3] [N]
     PinholeCamera camera;
-    // Out. `screen` rows: x, y (pixels), A, B, C, L with log2(alpha) = A dx^2 + B dx dy + C dy^2 + L, and the dy / dx at
-    // which that is largest for a given dx, and dx / dy for a given dy.
+    // Out. Rows of `screen`: x, y (pixels), A, B, C, L with log2(alpha) = A dx^2 + B dx dy + C dy^2 + L, then dy / dx of its maximum
+    // for a given dx, and dx / dy for a given dy.
     float *screen;  // [N,8]
     float *depth;   // [N]
-    float *radius;  // [N] three standard deviations of the wider axis in pixels, 0 where culled
-    int32_t *box;   // [N,4] first and last-plus-one tile in x and y; empty where culled
+    float *radius;  // [N] three standard deviations of the wider axis in pixels; 0 if culled
+    int32_t *box;   // [N,4] first tile and last tile plus one in x and y; empty if culled
 };
 
-// Tiles of one row that lie side by side. What a Gaussian touches of a row is one run: an ellipse is convex.
+// Adjacent tiles of one row. A Gaussian touches one run per row, because an ellipse is convex.
 struct TileRun {
-    uint16_t row, begin, end; // begin and end are columns, the end not included
+    uint16_t row, begin, end; // columns; the end is not included
 };
 
 struct TileEmitArgs {
     const float *screen;
     const int32_t *box;
-    const int64_t *offset;  // [N] where this Gaussian's runs begin
-    TileRun *runs;          // [rows of tiles of all boxes] the tiles it really touches, from its offset on
-    int32_t *count;         // [N] how many runs
-    int32_t *touched;       // [N] how many tiles
+    const int64_t *offset;  // [N] first run of each Gaussian
+    TileRun *runs;          // [rows of tiles of all boxes] touched tiles of each Gaussian, from its offset on
+    int32_t *count;         // [N] number of runs
+    int32_t *touched;       // [N] number of tiles
 };
 
 struct RasterArgs {
@@ -55,23 +55,23 @@ struct RasterArgs {
     const float *screen;            // [N,8]
     const float *features;          // [N, channels_real]
     const int32_t *permutation;     // [channels_real] statistic channels first
-    bool in_order;                  // it leaves every channel where it is
+    bool in_order;                  // the permutation is the identity
     const int64_t *tile_begin;      // [tiles + 1]
     const int32_t *gaussians;       // [instances] by tile, in depth order
-    const int64_t *instances;       // [instances] row in the instance gradient buffer; as the following two
-    // What the forward pass gathered, and the backward pass then reads; null: for this picture there is none.
+    const int64_t *instances;       // [instances] row in the buffer of instance gradients; for the backward pass
+    // Data of the forward pass for the backward pass; null without a backward pass.
     float *rows;                    // [instances, channels + 6] by tile: x, y relative to its center, A, B, C, L, features
-    uint16_t *blocks;               // [instances] one bit for each of the tile's blocks that the Gaussian touches
+    uint16_t *blocks;               // [instances] one bit for each block of the tile that the Gaussian touches
     // Forward, out
     float *out;                     // [H,W,channels_real]
     float *alpha;                   // [H,W]
-    float *transmittance;           // [H,W], for the backward pass; null: for this picture there is none
+    float *transmittance;           // [H,W], for the backward pass; null without a backward pass
     int64_t *pairs;                 // optional [tiles]: contributing pixel-Gaussian pairs
-    float surface_width;            // of what is blended around the median depth, in shares of that
+    float surface_width;            // standard deviation around the median depth, as a share of this depth
     // Backward, in (out and transmittance are read)
     const float *grad_out, *grad_alpha; // [H,W,channels_real], [H,W]
-    const float *grad_still;            // [H,W,still_count] to the features alone; null: none
-    const int32_t *still;               // [channels_real] which channel of it each channel gets, -1: none
+    const float *grad_still;            // [H,W,still_count] gradient of the features alone; may be null
+    const int32_t *still;               // [channels_real] channel of grad_still for each channel; -1: none
     int still_count;
     int statistic_channels;
     float *grad_instances;          // [instances, channels + instance_extra]
@@ -87,11 +87,11 @@ struct ProjectBackwardArgs {
     float *statistic; // [N,2] or null
 };
 
-// Scratch of one worker, sized for the longest tile list.
+// Scratch of one worker, with the size of the longest tile list.
 struct RasterScratch {
-    float *rows;      // [n, channels + 6] Gaussians of the tile, where they are not kept
-    uint16_t *blocks; // [n] which blocks they touch, likewise
-    int32_t *list;    // [n] those that touch one block
+    float *rows;      // [n, channels + 6] Gaussians of the tile, unless stored for the backward pass
+    uint16_t *blocks; // [n] blocks that they touch, likewise
+    int32_t *list;    // [n] Gaussians that touch one block
     float *moments;   // [n, channels + 9], or [n, 16]
 };
 
@@ -102,10 +102,10 @@ POLARGUIDE_DECLARE(void raster_surface(const RasterArgs &args, int64_t tile, con
 POLARGUIDE_DECLARE(void raster_backward(const RasterArgs &args, int64_t tile, const RasterScratch &scratch))
 POLARGUIDE_DECLARE(void project_backward(const ProjectBackwardArgs &args, int64_t begin, int64_t end))
 POLARGUIDE_DECLARE(int64_t first_not_finite(const float *values, int64_t count)) // index, or -1
-POLARGUIDE_DECLARE(float fma_burst(int64_t rounds)) // 512 fused multiply-adds of 16 lanes a round
+POLARGUIDE_DECLARE(float fma_burst(int64_t rounds)) // 512 fused multiply-adds of 16 lanes per round
 constexpr int64_t fma_burst_flops = 2 * 16 * 512;
 
-// The smallest compiled channel count that holds `channels`, or 0.
+// Returns the smallest compiled number of channels that is at least `channels`, or 0.
 int padded_channels(int channels);
 
 } // namespace polarguide

@@ -5,13 +5,13 @@ namespace polarguide {
 namespace POLARGUIDE_ISA {
 namespace {
 
-// Gradients of one block, loaded pixel-wise into lanes.
+// Gradients of one block, one pixel per lane.
 template <int D> struct BlockGradients {
-    // To what is drawn, and to the features: what comes to these alone moves and fades no Gaussian.
+    // Gradients of the picture, and gradients of the features alone, which do not move Gaussians or change their opacity.
     alignas(64) float g[D][16], own[D][16];
     const float (*features)[16];
-    // Sum over what is not yet passed of weight * (feature . g): of all channels and the alpha output, and of those of
-    // the statistic alone.
+    // Sum of weight * (feature . g) over the Gaussians that remain: for all channels and alpha, and for channels of the statistic
+    // alone.
     alignas(64) float remaining[16], remaining_statistic[16];
 };
 template <int D>
@@ -42,15 +42,15 @@ POLARGUIDE_INLINE void load_gradients(const RasterArgs &a, const Block &b, Block
         }
 }
 
-// A batch of up to sixteen Gaussians of one block: per-pixel weights and exponent gradients, one row each.
+// Batch of up to sixteen Gaussians of one block: per-pixel weights and exponent gradients, one row each.
 struct Batch {
     alignas(64) float weight[16][16], value[16][16], statistic[16][16];
     int32_t local[16];
     int size = 0;
 };
 
-// Moments 1, x, y, xx, xy, yy of a block's pixels about the tile center, of as many Gaussians as a register has lanes
-// (transposed: v[16 * pixel] is the first of them).
+// Computes moments 1, x, y, xx, xy, yy of a block's pixels about the tile center, one Gaussian per lane of a register
+// (transposed: v[16 * pixel] is the first one).
 POLARGUIDE_INLINE void moments(const float *v, float x, float y, bool second, reg *m) {
     reg column[4], row[4], xy = {};
     for (int i = 0; i < 4; ++i) column[i] = reg_load(v + 16 * i);
@@ -73,8 +73,8 @@ POLARGUIDE_INLINE void moments(const float *v, float x, float y, bool second, re
     m[5] = yy + (my + m[2]) * y;
 }
 
-// Adds the sums of a batch to the tile's rows: D feature gradients, six moments of the exponent gradient, three of the
-// statistic's.
+// Adds the sums of a batch to the rows of the tile: D feature gradients, six moments of the exponent gradient, and three
+// moments of the statistic's gradient.
 template <int D, bool S>
 __attribute__((noinline)) void flush(Batch &batch, const BlockGradients<D> &gradients, float x, float y, float *rows) {
     constexpr int quantities = D + (S ? 9 : 6), stride = D + 9, groups = (quantities + 15) / 16;
@@ -85,7 +85,7 @@ __attribute__((noinline)) void flush(Batch &batch, const BlockGradients<D> &grad
         if (S) store(batch.statistic[i], vf{});
     }
     transpose16(batch.weight[0], t);
-    constexpr int step = 4; // channels at a time: independent chains, few registers
+    constexpr int step = 4; // channels per iteration: independent chains, few registers
     for (int l = 0; l < lanes; l += reg_lanes)
         for (int k0 = 0; k0 < D; k0 += step) {
             reg acc[step] = {};
@@ -118,19 +118,19 @@ __attribute__((noinline)) void flush(Batch &batch, const BlockGradients<D> &grad
         for (int q = first + used; q < first + 16; ++q) store(sums[q], vf{});
         transpose16(sums[first], t);
         for (int i = 0; i < batch.size; ++i) {
-            float *row = rows + int64_t(batch.local[i]) * stride + first; // rows have room for a whole vector at the end
+            float *row = rows + int64_t(batch.local[i]) * stride + first; // rows have space for a whole vector at the end
             store(row, load(row) + load(t + 16 * i));
         }
     }
     batch.size = 0;
 }
 
-// Statistic channels: none, the first three, or as many as the arguments say.
+// Statistic channels: none, the first three, or the number in the arguments.
 enum { statistic_none = 0, statistic_three = 3, statistic_any = -1 };
 
 template <int D, int S>
 POLARGUIDE_INLINE void backward_block(const RasterArgs &a, const Tile &t, int count, const Block &b, const RasterScratch &s) {
-    constexpr int parts = lanes / reg_lanes; // of a block's pixels
+    constexpr int parts = lanes / reg_lanes; // registers per block of pixels
     BlockGradients<D> gradients;
     load_gradients<D>(a, b, &gradients);
     Pixels pixels[parts];

@@ -5,7 +5,7 @@ namespace polarguide {
 namespace POLARGUIDE_ISA {
 namespace {
 
-// Channels and transmittance of a block's pixels, to where they lie in the picture.
+// Writes channels and transmittance of a block's pixels to the picture.
 template <int D> POLARGUIDE_INLINE void write_block(const RasterArgs &a, const Block &b, const float (*values)[16]) {
     const int real = a.channels_real;
     const int rows = a.height - b.y < 4 ? a.height - b.y : 4, columns = a.width - b.x < 4 ? a.width - b.x : 4;
@@ -34,7 +34,7 @@ template <int D> void forward_tile(const RasterArgs &a, int64_t tile, const Rast
         for (int l = 0; l < lanes; l += reg_lanes) {
             const Pixels pixels = pixels_from(b, l);
             reg acc[D] = {};
-            reg live = reg_splat(1.0f), final = live; // transmittance; `live` never rises again where a pixel has ended
+            reg live = reg_splat(1.0f), final = live; // transmittance; `live` remains low after the end of a pixel
             for (int i = 0; i < n; ++i) {
                 const float *row = t.rows + int64_t(s.list[i]) * (D + 6);
                 const Blended next = blended(live, alpha_at(row, pixels).value);

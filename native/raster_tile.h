@@ -1,4 +1,4 @@
-// A tile as both passes of the blending see it: its Gaussians gathered, its blocks, and what a Gaussian covers in them.
+// Tile in both passes of the blending: its gathered Gaussians, its blocks, and the coverage of a Gaussian in them.
 #pragma once
 #include "peak.h"
 #include "raster.h"
@@ -16,8 +16,8 @@ alignas(64) const float lane_x[16] = {-1.5f, -.5f, .5f, 1.5f, -1.5f, -.5f, .5f, 
 alignas(64) const float lane_y[16] = {-1.5f, -1.5f, -1.5f, -1.5f, -.5f, -.5f, -.5f, -.5f,
                                       .5f,   .5f,   .5f,   .5f,   1.5f, 1.5f, 1.5f, 1.5f};
 
-// The blocks (one bit each) of a tile in which log2(alpha) of a Gaussian can reach the threshold. `row` is relative to the
-// tile center, `to_y` and `to_x` are as for `peak_inside`.
+// Returns the blocks (one bit each) of a tile in which log2(alpha) of a Gaussian can reach the threshold. `row` is relative to the
+// tile center; for `to_y` and `to_x` see `peak_inside`.
 POLARGUIDE_INLINE uint32_t touched_blocks(const float *row, float to_y, float to_x) {
     uint32_t blocks = 0;
     for (int l = 0; l < lanes; l += reg_lanes) {
@@ -30,7 +30,7 @@ POLARGUIDE_INLINE uint32_t touched_blocks(const float *row, float to_y, float to
 
 struct Tile {
     const float *rows;      // [count, channels + 6]
-    const uint16_t *blocks; // [count] which of the tile's blocks each touches
+    const uint16_t *blocks; // [count] blocks of the tile that each touches
     int count;
     int x0, y0;
     float center_x, center_y;
@@ -45,17 +45,17 @@ POLARGUIDE_INLINE Tile open_tile(const RasterArgs &a, int64_t tile, const float 
     return t;
 }
 
-// Whether a Gaussian's features are read and written as they lie: a copy whose length the compiler knows.
+// True if a Gaussian's features keep their order, so that the compiler knows the length of the copy.
 template <int D> POLARGUIDE_INLINE bool in_order(const RasterArgs &a) { return a.in_order && a.channels_real == D; }
 
-// Gathers the tile's Gaussians into contiguous rows and finds the blocks that they touch.
+// Gathers the Gaussians of the tile into contiguous rows and finds the blocks that they touch.
 template <int D> POLARGUIDE_INLINE Tile gather_tile(const RasterArgs &a, int64_t tile, const RasterScratch &s) {
     const int64_t begin = a.tile_begin[tile];
     float *rows = a.rows ? a.rows + begin * (D + 6) : s.rows;
     uint16_t *blocks = a.blocks ? a.blocks + begin : s.blocks;
     const Tile t = open_tile(a, tile, rows, blocks);
     const int real = a.channels_real;
-    constexpr int ahead = 12; // neighbors in depth lie anywhere in memory: asked for before they are needed
+    constexpr int ahead = 12; // neighbors in depth are scattered in memory, so they are prefetched
     for (int i = 0; i < t.count; ++i) {
         if (i + ahead < t.count) {
             const int64_t next = a.gaussians[begin + i + ahead];
@@ -79,7 +79,7 @@ template <int D> POLARGUIDE_INLINE Tile gather_tile(const RasterArgs &a, int64_t
     return t;
 }
 
-// The same tile again in the backward pass, from what the forward pass kept.
+// Returns the tile in the backward pass, from the data of the forward pass.
 template <int D> POLARGUIDE_INLINE Tile reopen_tile(const RasterArgs &a, int64_t tile) {
     const int64_t begin = a.tile_begin[tile];
     return open_tile(a, tile, a.rows + begin * (D + 6), a.blocks + begin);
@@ -96,7 +96,7 @@ POLARGUIDE_INLINE bool open_block(const RasterArgs &a, const Tile &t, int block,
     return out->x < a.width && out->y < a.height;
 }
 
-// As many of a block's pixels as a register has lanes, from the l-th on: their centers relative to the tile center.
+// Pixels of a block, one per lane of a register, from the l-th on: centers relative to the tile center.
 struct Pixels {
     reg x, y;
 };
@@ -105,23 +105,23 @@ POLARGUIDE_INLINE Pixels pixels_from(const Block &b, int l) {
 }
 
 struct Alpha {
-    reg value;      // 0 where the Gaussian does not contribute
-    lane_mask free; // where the cap does not hold it
+    reg value;      // 0 if the Gaussian does not contribute
+    lane_mask free; // true if alpha is below its maximum
 };
 POLARGUIDE_INLINE Alpha alpha_at(const float *row, const Pixels &p) {
     Alpha r;
     const reg dx = p.x - row[0], dy = p.y - row[1];
     const reg e = (dx * row[2] + dy * row[3]) * dx + ((dy * row[4]) * dy + row[5]);
-    const reg alpha = exp2_looked_up(e), most = reg_splat(maximum_alpha); // of no meaning far below the threshold, and not used there
+    const reg alpha = exp2_looked_up(e), most = reg_splat(maximum_alpha); // undefined far below the threshold, where it is not used
     r.free = at_least(most, alpha);
     r.value = where(at_least(e, reg_splat(log2_minimum)), min(alpha, most));
     return r;
 }
 
-// One Gaussian more before some pixels of a transmittance, which never rises again where a pixel has ended.
+// Blends one more Gaussian at some pixels with a transmittance, which remains low after the end of a pixel.
 struct Blended {
-    reg weight, live; // 0 where the pixel has ended; the transmittance behind it
-    lane_mask go;     // where it has not
+    reg weight, live; // 0 after the end of the pixel; transmittance behind the Gaussian
+    lane_mask go;     // true before the end of the pixel
 };
 POLARGUIDE_INLINE Blended blended(reg live, reg alpha) {
     Blended r;

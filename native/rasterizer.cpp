@@ -23,7 +23,7 @@ Rasterizer::Rasterizer(const PinholeCamera &camera, std::vector<int32_t> permuta
       tiles_y_((camera.height + tile_size - 1) / tile_size) {}
 
 void Rasterizer::bin(int64_t count, bool for_backward) {
-    // Of each Gaussian's box, the tiles that it really touches: a run in each row.
+    // Find the tiles that each Gaussian touches within its box: one run per row.
     std::vector<int64_t> offset(size_t(count) + 1, 0);
     for (int64_t g = 0; g < count; ++g) offset[size_t(g) + 1] = offset[size_t(g)] + box_.get()[4 * g + 3] - box_.get()[4 * g + 2];
     Buffer<TileRun> runs;

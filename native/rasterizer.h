@@ -1,4 +1,4 @@
-// One picture: from Gaussians to channels and back. Owns what the backward pass needs from the forward pass.
+// Rasterizer of one picture, from Gaussians to channels and back. It owns the data of the forward pass for the backward pass.
 #pragma once
 #include "buffer.h"
 #include "raster.h"
@@ -16,20 +16,20 @@ struct GaussianInputs {
 
 class Rasterizer {
   public:
-    // `permutation` lists the channels, those of the statistic first.
+    // `permutation` lists the channels, with channels of the statistic first.
     Rasterizer(const PinholeCamera &camera, std::vector<int32_t> permutation, int statistic_channels);
-    // What a backward pass reads is kept only `for_backward`.
+    // Data for the backward pass is stored only with `for_backward`.
     void forward(const GaussianInputs &in, float *out, float *alpha, float *radius, bool count_pairs, bool for_backward);
-    // Of four channels, the last camera depth: their means around each pixel's median depth.
+    // Computes the means of four channels, the last one camera depth, around the median depth of each pixel.
     void surface(const GaussianInputs &in, float width, float *out);
     bool kept() const { return kept_; }
     struct Gradients {
         float *means, *quaternions, *scales, *opacities, *features, *statistic; // statistic may be null
     };
-    // A gradient that reaches the features of some channels alone, [H,W,count]; none: `values` is null.
+    // Gradient of some channels' features alone, [H,W,count]; `values` is null without it.
     struct StillGradient {
         const float *values;
-        std::vector<int32_t> of_channel; // [channels] which of them each channel gets, -1: none
+        std::vector<int32_t> of_channel; // [channels] channel of `values` for each channel; -1: none
         int count;
     };
     void backward(const GaussianInputs &in, const float *out, const float *grad_out, const float *grad_alpha,

@@ -1,5 +1,5 @@
-// Deferred reflection per pixel, around the look-up in the cubemap: rays mirrored at blended normals before it, the
-// layers of the picture after it, and both gradients.
+// Deferred reflection per pixel: rays mirrored at blended normals before the look-up in the cubemap, layers of the picture
+// after it, and both gradients.
 #include "image.h"
 #include "mirror.h"
 
@@ -9,7 +9,7 @@ namespace {
 
 constexpr float least_alpha = 1e-6f, log2_e = 1.44269504f;
 
-// Columns `first` to `first` + W of as many rows as a register has lanes; rows from n on are zero.
+// Loads columns `first` to `first` + W, one row per lane of a register; rows from n on are zero.
 template <int W> POLARGUIDE_INLINE void columns_of(const float *rows, int stride, int first, int n, reg *columns) {
     alignas(64) float t[W][reg_lanes] = {};
     for (int l = 0; l < n; ++l)
@@ -24,7 +24,7 @@ POLARGUIDE_INLINE Mirror mirror_at(const ReflectArgs &a, int64_t i, int n) {
     return mirror_of(ray, blended);
 }
 
-// Unpolarized power reflectance where the ray meets the normal, and its derivative by their product.
+// Unpolarized power reflectance for a ray and a normal, and its derivative with respect to their product.
 POLARGUIDE_INLINE reg reflectance(reg along, reg refractive_index, reg *by_along) {
     const reg c = clamp(-along, reg{}, reg_splat(1.0f)); // the cosine
     const reg n2 = refractive_index * refractive_index;
@@ -37,8 +37,8 @@ POLARGUIDE_INLINE reg reflectance(reg along, reg refractive_index, reg *by_along
 }
 
 struct Light {
-    reg value[3], slope[3]; // and derivative by what the look-up gave
-    ireg lit[3];            // not cut at 0
+    reg value[3], slope[3]; // and derivative with respect to the look-up
+    ireg lit[3];            // not clamped at 0
 };
 
 POLARGUIDE_INLINE Light light_at(const ReflectArgs &a, int64_t i, int n) {
@@ -50,7 +50,7 @@ POLARGUIDE_INLINE Light light_at(const ReflectArgs &a, int64_t i, int n) {
         if (a.fresnel) {
             l.value[k] = raw[k], l.slope[k] = reg_splat(1.0f);
         } else {
-            // Beyond 80 there is nothing left that a float could tell; NaN stays.
+            // Above 80 the exponential overflows; NaN stays.
             const reg bounded = raw[k] < -80.0f ? reg_splat(-80.0f) : raw[k] > 80.0f ? reg_splat(80.0f) : raw[k];
             l.value[k] = 1.0f / (1.0f + exp2(-log2_e * bounded));
             l.slope[k] = l.value[k] * (1.0f - l.value[k]);
@@ -62,23 +62,23 @@ POLARGUIDE_INLINE Light light_at(const ReflectArgs &a, int64_t i, int n) {
     return l;
 }
 
-// A gradient [P,3] that may be missing.
+// Optional gradient [P,3].
 POLARGUIDE_INLINE void gradient_at(const float *gradient, int64_t i, int n, reg *columns) {
     if (gradient) return load_columns<3>(gradient + 3 * i, n, columns);
     for (int k = 0; k < 3; ++k) columns[k] = reg{};
 }
 
-// The factor between a pixel's blended roughness and its mip level: the roughness is a mean, weighted as it was blended.
+// Factor from the blended roughness of a pixel to its mip level, which belongs to the mean roughness (blended over alpha).
 POLARGUIDE_INLINE reg levels_of(const ReflectArgs &a, int64_t i, int n) {
     reg alpha;
     load_columns<1>(a.alpha + i, n, &alpha);
     return a.blur / (alpha > least_alpha ? alpha : reg_splat(least_alpha));
 }
 
-// How much of the light shows, and of the base color: strength times Fresnel's reflectance, and all, or the lerp.
+// Weights of light and base color: strength times Fresnel's reflectance and 1, or the weights of the lerp.
 struct Blend {
     reg share, kept; // specular = strength share light, diffuse = kept base
-    reg by_along;    // derivative of the share by ray . normal
+    reg by_along;    // derivative of the share with respect to ray . normal
 };
 
 POLARGUIDE_INLINE Blend blend_of(const ReflectArgs &a, int64_t i, int n, reg strength, reg along) {
@@ -140,9 +140,9 @@ void reflect_layers(const ReflectArgs &a, int64_t begin, int64_t end) {
     }
 }
 
-// Gradients by the look-up, and by the features except the part of the normal that comes through the look-up, which
-// reflect_backward_directions adds. Channels beyond those that are read get zero. What comes by the held layers reaches
-// everything but the normal: it is in `grad_texels` alone of the two gradients by the look-up.
+// Computes gradients of the look-up and of the features. reflect_backward_directions adds the part of the normal that passes
+// through the look-up. Unused channels get zero. Gradients of the held layers do not reach the normal: of both gradients of the
+// look-up, only `grad_texels` includes them.
 void reflect_backward_layers(const ReflectArgs &a, int64_t begin, int64_t end) {
     const bool held = a.grad_held_specular || a.grad_held_diffuse;
     for (int64_t i = begin; i < end; i += reg_lanes) {
@@ -205,7 +205,7 @@ void gbuffer_split(const GBufferArgs &a, int64_t begin, int64_t end) {
     }
 }
 
-// The gradient of everything that was read of the features, in one pass.
+// Computes the gradient of all results of gbuffer_split in one pass.
 void gbuffer_join(const GBufferArgs &a, int64_t begin, int64_t end) {
     for (int64_t i = begin; i < end; ++i) {
         const float *from = a.grad_features + a.channels * i;

@@ -1,5 +1,5 @@
-// Sixteen-lane vectors with GNU vector types: one source for every instruction set. The compiler splits a vector
-// into as many registers as the target needs (one on AVX-512, two on AVX2, four on SSE2 and NEON).
+// Sixteen-lane vectors with GNU vector types: one source for all instruction sets. The compiler splits a vector into the
+// registers of the target (one on AVX-512, two on AVX2, four on SSE2 and NEON).
 #pragma once
 #include <stdint.h>
 
@@ -29,8 +29,8 @@ typedef float v4f __attribute__((vector_size(16), aligned(4), may_alias));
 POLARGUIDE_INLINE vf splat(float x) { return vf{} + x; }
 POLARGUIDE_INLINE vf load(const float *p) { return *reinterpret_cast<const vf_unaligned *>(p); }
 POLARGUIDE_INLINE void store(float *p, vf x) { *reinterpret_cast<vf_unaligned *>(p) = x; }
-// To memory past the caches, where the processor can: for what is more than they hold. `p` at a multiple of 64 bytes.
-// `end_stream` comes before another thread reads it.
+// Writes to memory without using the caches, if the processor supports it, for data larger than the caches. `p` is a multiple
+// of 64 bytes. Call `end_stream` before another thread reads the data.
 POLARGUIDE_INLINE void stream(float *p, vf x) {
 #if defined(__AVX512F__)
     _mm512_stream_ps(p, reinterpret_cast<__m512 &>(x));
@@ -50,8 +50,8 @@ template <class V> POLARGUIDE_INLINE V min(V a, V b) { return a < b ? a : b; }
 template <class V> POLARGUIDE_INLINE V max(V a, V b) { return a > b ? a : b; }
 template <class V> POLARGUIDE_INLINE V clamp(V x, V low, V high) { return max(low, min(x, high)); }
 
-// One register of the target. GCC compares and selects lane by lane in vectors wider than that, so code with many
-// comparisons, or with more sums than a small register file holds as wide vectors, is written with this type.
+// One register of the target. GCC compares and selects lane by lane in wider vectors, so code with many comparisons uses this
+// type. So does code with more sums than a small register file can hold as wide vectors.
 #if defined(__AVX512F__)
 typedef vf reg;
 typedef vf_unaligned reg_unaligned;
@@ -62,13 +62,13 @@ typedef float reg_unaligned __attribute__((vector_size(32), aligned(4), may_alia
 typedef float reg __attribute__((vector_size(16), may_alias));
 typedef v4f reg_unaligned;
 #endif
-typedef decltype(reg{} < reg{}) ireg; // of integers: what comparisons give
+typedef decltype(reg{} < reg{}) ireg; // integers: results of comparisons
 constexpr int reg_lanes = sizeof(reg) / sizeof(float);
 POLARGUIDE_INLINE reg reg_splat(float x) { return reg{} + x; }
 POLARGUIDE_INLINE reg reg_load(const float *p) { return *reinterpret_cast<const reg_unaligned *>(p); }
 POLARGUIDE_INLINE void reg_store(float *p, reg x) { *reinterpret_cast<reg_unaligned *>(p) = x; }
 
-// Bit l is set where lane l of a comparison result is true.
+// Bit l is set if lane l of a comparison result is true.
 POLARGUIDE_INLINE uint32_t bits(ireg mask) {
 #if defined(__AVX512F__)
     return _mm512_movepi32_mask(reinterpret_cast<__m512i &>(mask));
@@ -82,8 +82,8 @@ POLARGUIDE_INLINE uint32_t bits(ireg mask) {
     return result;
 #endif
 }
-// Comparisons for loops that ask about all lanes at once: where AVX-512 has a register of bits for them, GCC would carry
-// a comparison's result there by way of a vector.
+// Comparisons for loops that test all lanes at once. AVX-512 has registers of bits for them, but GCC would move the result of a
+// comparison there through a vector.
 #if defined(__AVX512F__)
 typedef __mmask16 lane_mask;
 POLARGUIDE_INLINE lane_mask at_least(reg a, reg b) { return _mm512_cmp_ps_mask(a, b, _CMP_GE_OQ); }
@@ -97,7 +97,7 @@ POLARGUIDE_INLINE lane_mask at_least(reg a, reg b) { return a >= b; }
 POLARGUIDE_INLINE reg where(lane_mask mask, reg a, reg b) { return mask ? a : b; }
 POLARGUIDE_INLINE reg where(lane_mask mask, reg a) { return mask ? a : reg{}; }
 #endif
-// The same as of the templates above, NaN included: GCC would compare and select.
+// Equal to the templates above, also for NaN; GCC would compare and select.
 #if defined(__AVX512F__)
 POLARGUIDE_INLINE reg min(reg a, reg b) { return _mm512_min_ps(a, b); }
 POLARGUIDE_INLINE reg max(reg a, reg b) { return _mm512_max_ps(a, b); }
@@ -118,7 +118,8 @@ POLARGUIDE_INLINE bool any(ireg mask) {
 #endif
 }
 
-// Where a bit is set in `count` words, in order, and how many they are. Both arrays have room for a whole vector at the end.
+// Finds the words among `count` with a certain bit, in order, and returns their number. Both arrays have space for a whole vector
+// at the end.
 POLARGUIDE_INLINE int positions_of_bit(const uint16_t *words, int count, int bit, int32_t *positions) {
     int found = 0;
 #if defined(__AVX512F__)
@@ -132,7 +133,7 @@ POLARGUIDE_INLINE int positions_of_bit(const uint16_t *words, int count, int bit
         found += __builtin_popcount(set);
     }
 #else
-    for (int i = 0; i < count; ++i) positions[found] = i, found += words[i] >> bit & 1; // no branch to guess wrong
+    for (int i = 0; i < count; ++i) positions[found] = i, found += words[i] >> bit & 1; // without a branch to mispredict
 #endif
     return found;
 }
@@ -168,10 +169,10 @@ template <class V> POLARGUIDE_INLINE V exp2(V x) {
     return (V)((I)p + ((I)shifted << 23));
 }
 
-// The same, relative error about 5e-7. Where one instruction looks sixteen values up, three multiplications shorter.
+// 2^x with a relative error of about 5e-7; if one instruction looks up sixteen values, it needs three multiplications fewer.
 POLARGUIDE_INLINE reg exp2_looked_up(reg x) {
 #if defined(__AVX512F__)
-    // 2^(k/16) as integers, less what k adds to the exponent below.
+    // 2^(k/16) as integers, minus the contribution of k to the exponent below.
     const __m512i powers =
         _mm512_setr_epi32(0x3f800000, 0x3f7daac3, 0x3f7b95c2, 0x3f79c3d3, 0x3f7837f0, 0x3f76f532, 0x3f75fed7, 0x3f75583f,
                           0x3f7504f3, 0x3f7508a4, 0x3f75672a, 0x3f76248c, 0x3f7744fd, 0x3f78ccdf, 0x3f7ac0c7, 0x3f7d257d);
@@ -187,7 +188,7 @@ POLARGUIDE_INLINE reg exp2_looked_up(reg x) {
 #endif
 }
 
-// log2 of positive normal numbers, to about 1e-7 of its value.
+// log2 of positive normal numbers, relative error about 1e-7.
 template <class V> POLARGUIDE_INLINE V log2(V x) {
     using I = decltype(x < x);
     I raw = (I)x;
@@ -198,7 +199,7 @@ template <class V> POLARGUIDE_INLINE V log2(V x) {
     return __builtin_convertvector(exponent, V) + s * series * 2.88539008f;
 }
 
-// As many rows of W floats as V has lanes, one vector a column, and back; rows from n on are zero, or left alone.
+// Transposes rows of W floats, one row per lane of V, to one vector per column, and back; rows from n on are zero or unchanged.
 template <int W, class V> POLARGUIDE_INLINE void load_columns(const float *rows, int n, V *columns) {
     constexpr int count = sizeof(V) / sizeof(float);
     alignas(64) float t[W][count] = {};

@@ -1,4 +1,4 @@
-// From the parameters of Gaussians to what a rasterizer takes, and back: rows of features, scales and opacities.
+// Input of a rasterizer from the parameters of Gaussians (rows of features, scales and opacities), and its gradient.
 #include "gaussians.h"
 #include "raster.h"
 #include "simd.h"
@@ -7,9 +7,9 @@ namespace polarguide {
 namespace POLARGUIDE_ISA {
 namespace {
 
-constexpr float log2_e = 1.44269504f, largest = 83.0f; // e^83 is about the largest power that exp2 gives
+constexpr float log2_e = 1.44269504f, largest = 83.0f; // e^83 is about the maximum of exp2
 
-// NaN stays; too large a value becomes infinite, as of any exponential.
+// NaN stays; too large values become infinite, as for any exponential.
 POLARGUIDE_INLINE reg exponential(reg x) {
     const reg bounded = x < -largest ? reg_splat(-largest) : x > largest ? reg_splat(largest) : x;
     const reg value = exp2(bounded * log2_e);
@@ -21,8 +21,8 @@ POLARGUIDE_INLINE reg logistic(reg x) {
     return x != x ? x : value;
 }
 
-// The features of sixteen Gaussians, a column each, and their rows. A row is written sixteen floats at a time; what that
-// writes beyond its end belongs to the next row, which comes later. `room` floats may be touched.
+// Features of sixteen Gaussians as columns, and their rows. A row is written in vectors of sixteen floats. Floats beyond its
+// end belong to the next row, which is written later. At most `room` floats are touched.
 struct Columns {
     static constexpr int tiles = (max_channels + lanes - 1) / lanes;
     alignas(64) float value[tiles * lanes * lanes];
@@ -56,7 +56,7 @@ struct Columns {
     }
 };
 
-// Where the features of a row begin; -1: there are none.
+// First feature of each kind in a row; -1 without this kind.
 struct Layout {
     int normals, strength, light, further, depth;
 };
@@ -76,7 +76,7 @@ POLARGUIDE_INLINE Layout layout_of(const SplatArgs &a) {
     return l;
 }
 
-// Of 3 columns from rows of a compact array, for registers smaller than a block.
+// Loads 3 columns from rows of a compact array, for registers smaller than a block.
 POLARGUIDE_INLINE void spread3(const float *rows, int n, float *columns, int from) {
     reg c[3];
     load_columns<3>(rows, n, c);
@@ -112,7 +112,7 @@ void splat_assemble(const SplatArgs &a, int64_t begin, int64_t end) {
             load_columns<3>(a.color + 3 * i, n, x);
             for (int k = 0; k < 3; ++k) {
                 const reg sum = x[k] + 0.5f;
-                // Zero has a sign where the color was cut off: there it gets no gradient.
+                // A clamped color is a negative zero, which gets no gradient.
                 reg_store(c.at(k) + r, (sum < 0.0f ? -reg{} : sum) * body);
             }
             if (at.normals >= 0) spread3(a.normals + 3 * i, n, c.at(at.normals), r);

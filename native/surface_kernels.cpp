@@ -1,13 +1,13 @@
-// What a pixel's Gaussians show around its median depth. See src/polarguide/raster/surface.py for the definition.
+// Means over Gaussians around the median depth of a pixel. See src/polarguide/raster/surface.py for the definition.
 #include "raster_tile.h"
 
 namespace polarguide {
 namespace POLARGUIDE_ISA {
 namespace {
 
-constexpr int surface_channels = 4, depth_at = 6 + surface_channels - 1; // three of the caller's, then camera depth
+constexpr int surface_channels = 4, depth_at = 6 + surface_channels - 1; // three channels of the caller, then camera depth
 
-// Blended weights of the Gaussians in `list` at some pixels, as many rows as the result says; `total` is their sum.
+// Computes blended weights of the Gaussians in `list` at some pixels and returns the number of rows; `total` is their sum.
 POLARGUIDE_INLINE int blended_weights(const Tile &t, const int32_t *list, int count, const Pixels &pixels, float *weights,
                                       reg *total) {
     reg live = reg_splat(1.0f), sum = reg{};

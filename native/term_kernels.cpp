@@ -1,6 +1,6 @@
-// Terms of the loss on pixels, with their gradients. Pixels come in blocks; within a block every loop runs over one
-// value per pixel, so that the compiler makes vectors of them on each instruction set. A block's missing pixels are
-// zero, for which all that follows is finite.
+// Terms of the loss on pixels, with their gradients. Pixels are processed in blocks. Each loop in a block has one value per
+// pixel, so the compiler vectorizes it for each instruction set. Missing pixels of a block are zero, for which all results
+// are finite.
 #include "terms.h"
 
 #include <math.h>
@@ -10,9 +10,9 @@ namespace POLARGUIDE_ISA {
 namespace {
 
 constexpr int block = 64;
-constexpr float shortest = 1e-2f;           // length below which a blended normal is not brought to 1
-constexpr float no_length = 1.1920929e-7f;  // below it a normal has no direction
-constexpr float no_area = 1e-6f;            // the same of the normals of the depth, in units of the depth
+constexpr float shortest = 1e-2f;           // length below which a blended normal is not normalized
+constexpr float no_length = 1.1920929e-7f;  // length below which a normal has no direction
+constexpr float no_area = 1e-6f;            // the same for normals of the depth, in units of the depth
 constexpr float nearest = 1e-6f;            // depth
 
 typedef float Lane[block];
@@ -45,7 +45,7 @@ inline double sum_of(const double *values) {
     return sum;
 }
 
-// Rotated by the matrix [3,3], or by its transpose.
+// Rotates by the matrix [3,3] or by its transpose.
 inline void turn(const float *m, const Vec &v, Vec &out) {
     for (int l = 0; l < block; ++l)
         for (int r = 0; r < 3; ++r)
@@ -56,12 +56,12 @@ inline void turn_back(const float *m, const Vec &v, Vec &out) {
         for (int r = 0; r < 3; ++r) out.k[r][l] = m[r] * v.k[0][l] + m[3 + r] * v.k[1][l] + m[6 + r] * v.k[2][l];
 }
 
-// The unit normal's components toward the camera and along the lens frame (optics.lens_frame), Fresnel's degrees of
-// polarization over sin^2 (optics.dolp_slopes), and all that their gradient needs.
+// Components of the unit normal toward the camera and along the lens frame (optics.lens_frame), Fresnel's degrees of
+// polarization over sin^2 (optics.dolp_slopes), and intermediate values for their gradients.
 struct alignas(64) Surface {
     Vec unit, ray;           // camera axes
-    Lane inverse;            // 1 / length; 0 without a direction
-    Lane x, y, facing;       // facing: 1 where the cosine lies in [0, 1]
+    Lane inverse;            // 1 / length; 0 without direction
+    Lane x, y, facing;       // facing: 1 if the cosine lies in [0, 1]
     Lane specular, diffuse;  // degrees of polarization over sin^2
     Lane by_cosine[2];       // and their derivatives
     Lane double_cos, double_sin;
@@ -99,7 +99,7 @@ void surface_at(const Vec &normal, const Lane &index, Surface &s) {
     }
 }
 
-// What the gradient by a block's Stokes vectors is summed in, per color.
+// Sums of the gradient of a block's Stokes vectors, per color.
 struct alignas(64) StokesGradient {
     Vec s[3];
 };
@@ -120,7 +120,7 @@ inline void compare(const PolarizationArgs &a, int k, int64_t i, int n, const La
 
 } // namespace
 
-// What metals add, in two blocks of colors; zero without metal, for which all that follows is as if there were none.
+// Contribution of metals in two blocks of colors; zero without metal.
 namespace {
 inline void read_metal(const PolarizationArgs &a, int64_t i, int n, Vec &metal, Vec &field) {
     metal = Vec{}, field = Vec{};
@@ -210,7 +210,7 @@ void direction_term(const DirectionArgs &a, int64_t begin, int64_t end) {
                 squared += normal.k[r][l] * normal.k[r][l], along += normal.k[r][l] * direction.k[r][l];
             const bool whole = squared >= shortest * shortest;
             const float inverse = 1.0f / sqrtf(whole ? squared : shortest * shortest), cosine = along * inverse;
-            // The distance falls as the cosine grows, except on a plane's positive side.
+            // The distance decreases with the cosine, except on the positive side of a plane.
             const float sign = !a.plane || cosine < 0.0f ? -1.0f : cosine > 0.0f ? 1.0f : 0.0f;
             const float g = a.term.factor * weight[l] * sign * inverse, radial = whole ? cosine * inverse : 0.0f;
             sums[l] += double(weight[l] * (offset + (a.plane ? fabsf(cosine) : -cosine)));
@@ -223,7 +223,7 @@ void direction_term(const DirectionArgs &a, int64_t begin, int64_t end) {
 
 namespace {
 
-// A row of the depth picture: rays (x, y, 1) and their depths z, with zeros before it and up to the last block's end.
+// Row of the depth picture: rays (x, y, 1) and their depths z, with zeros before it and up to the end of the last block.
 constexpr int margin = 16;
 struct Line {
     float *x, *y, *z;
@@ -243,11 +243,11 @@ void lay_line(const ConsistencyArgs &a, int64_t row, int64_t room, const Line &l
 }
 
 struct Neighbors {
-    const float *x, *y, *z; // of the first pixel of a block
+    const float *x, *y, *z; // at the first pixel of a block
 };
 inline Neighbors from(const Line &line, int64_t at) { return {line.x + at, line.y + at, line.z + at}; }
 
-// Gradients of a block: by the blended normal in camera axes, and what goes to the depth of each neighbor.
+// Gradients of a block: of the blended normal in camera axes, and of the depth of each neighbor.
 struct alignas(64) DepthBlock {
     Vec normal, to_normal; // camera axes
     Lane weight, distance, to_left, to_right, to_up, to_down;
@@ -274,17 +274,17 @@ void consistency_block(const Neighbors &left, const Neighbors &right, const Neig
         b.to_normal.k[0][l] = pull * ux, b.to_normal.k[1][l] = pull * uy, b.to_normal.k[2][l] = pull * uz;
         const float radial = whole ? cosine : 0.0f, outer = pull * inverse * scale;
         const float gx = outer * (nx - radial * ux), gy = outer * (ny - radial * uy), gz = outer * (nz - radial * uz);
-        const float px = gy * dz - gz * dy, py = gz * dx - gx * dz, pz = gx * dy - gy * dx; // g x down: by across
-        const float qx = ay * gz - az * gy, qy = az * gx - ax * gz, qz = ax * gy - ay * gx; // across x g: by down
+        const float px = gy * dz - gz * dy, py = gz * dx - gx * dz, pz = gx * dy - gy * dx; // g x down: gradient of across
+        const float qx = ay * gz - az * gy, qy = az * gx - ax * gz, qz = ax * gy - ay * gx; // across x g: gradient of down
         b.to_right[l] = right.x[l] * px + right.y[l] * py + pz, b.to_left[l] = -(left.x[l] * px + left.y[l] * py + pz);
         b.to_down[l] = down.x[l] * qx + down.y[l] * qy + qz, b.to_up[l] = -(up.x[l] * qx + up.y[l] * qy + qz);
     }
 }
 
-// The lines before, of and after row y. They are kept between rows: each is laid once, and once more in every chunk.
+// Lines before, at and after row y. They are reused between rows: each is prepared once per chunk.
 struct Lines {
     Line line[3];
-    float *leftward, *rightward; // of a row, by the pixel that gives
+    float *leftward, *rightward; // contributions of a row, by source pixel
 };
 
 void consistency_row(const ConsistencyArgs &a, int64_t y, const Lines &lines) {
@@ -316,7 +316,7 @@ void consistency_row(const ConsistencyArgs &a, int64_t y, const Lines &lines) {
 
 } // namespace
 
-// Rows 1 to H - 2. Every row writes what it gives to the rows beside it, and consistency_gather adds that up.
+// Rows 1 to H - 2. Each row writes its contributions to the adjacent rows, and consistency_gather adds them.
 void consistency_term(const ConsistencyArgs &a, int64_t begin, int64_t end, float *scratch) {
     const int64_t room = consistency_room(a.width);
     Lines lines;

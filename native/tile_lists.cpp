@@ -9,11 +9,11 @@
 namespace polarguide {
 namespace {
 
-// Order of the visible Gaussians by depth, ties by index: a radix sort on the bits of the (positive) depths.
+// Sorts visible Gaussians by depth, ties by index, with a radix sort on the bits of the positive depths.
 std::vector<int32_t> depth_order(const float *depth, const int32_t *touched, int64_t count) {
     std::vector<int32_t> order, other;
     std::vector<uint32_t> keys, other_keys;
-    order.reserve(size_t(count)), keys.reserve(size_t(count)); // touched: its depth is positive, and ordered as its bits
+    order.reserve(size_t(count)), keys.reserve(size_t(count)); // visible Gaussians have positive depths, whose bits have the same order
     for (int64_t g = 0; g < count; ++g)
         if (touched[g] > 0) {
             uint32_t key;
@@ -21,7 +21,7 @@ std::vector<int32_t> depth_order(const float *depth, const int32_t *touched, int
             order.push_back(int32_t(g)), keys.push_back(key);
         }
     other.resize(order.size()), other_keys.resize(keys.size());
-    // Depths of one picture mostly differ by a factor of some hundred: less the least of them, two digits are enough.
+    // Depths of a picture usually differ by a factor below some hundred. With the minimum subtracted, two digits suffice.
     uint32_t least = ~0u, most = 0;
     for (uint32_t k : keys) least = std::min(least, k), most = std::max(most, k);
     for (uint32_t &k : keys) k -= least;
@@ -46,25 +46,25 @@ std::vector<int32_t> depth_order(const float *depth, const int32_t *touched, int
     return order;
 }
 
-// Runs of tiles by their rows.
+// Runs of tiles, sorted by row.
 struct Rows {
     struct Run {
         int32_t gaussian;
         uint16_t begin, end; // columns
     };
     Buffer<Run> runs;
-    Buffer<int64_t> numbers;                     // of each run's first tile (see TileLists::sort), for the backward pass
-    std::vector<int64_t> begin, instances_begin; // [rows + 1] where a row's runs begin, and what is listed for its tiles
+    Buffer<int64_t> numbers;                     // number of the first tile of each run (see TileLists::sort), for the backward pass
+    std::vector<int64_t> begin, instances_begin; // [rows + 1] first run of each row, and first instance of its tiles
 };
 
 Rows sort_into_rows(const Workers &workers, const TileEmitArgs &emitted, const std::vector<int32_t> &order,
                     const int64_t *first, int64_t rows, bool for_backward) {
     Rows out;
-    // The order is cut into parts, one a thread. What a part has in a row comes behind what the parts before it have there.
+    // The order is divided into parts, one per thread. In each row, runs of a part follow runs of the previous parts.
     const int64_t parts = workers.count(), length = (int64_t(order.size()) + parts - 1) / parts;
     const int64_t *offset = emitted.offset;
-    auto each = [&](int64_t part, auto &&body) { // body(Gaussian, its runs, how many)
-        constexpr int64_t ahead = 12; // neighbors in depth lie anywhere in memory: asked for before they are needed
+    auto each = [&](int64_t part, auto &&body) { // body(Gaussian, its runs, their number)
+        constexpr int64_t ahead = 12; // neighbors in depth are scattered in memory, so they are prefetched
         const int64_t end = std::min(int64_t(order.size()), (part + 1) * length);
         for (int64_t k = part * length; k < end; ++k) {
             if (k + 2 * ahead < end) {
@@ -76,7 +76,7 @@ Rows sort_into_rows(const Workers &workers, const TileEmitArgs &emitted, const s
             body(g, emitted.runs + offset[g], emitted.count[g]);
         }
     };
-    std::vector<int64_t> next(size_t(parts * rows), 0), touched(next); // runs: how many, then where the next goes
+    std::vector<int64_t> next(size_t(parts * rows), 0), touched(next); // runs: their number, then the place of the next one
     auto count = [&](int64_t part, int64_t, int) {
         int64_t *runs_here = next.data() + part * rows, *tiles_here = touched.data() + part * rows;
         each(part, [&](int32_t, const TileRun *runs, int32_t n) {
@@ -113,7 +113,7 @@ Rows sort_into_rows(const Workers &workers, const TileEmitArgs &emitted, const s
 
 } // namespace
 
-// What a row's lists are written to stays in a cache, which the lists of a whole picture do not.
+// The lists of one row fit into a cache, unlike the lists of a whole picture.
 void TileLists::sort(const TileEmitArgs &emitted, const float *depth, const int64_t *first, int64_t count, int tiles_x,
                      int tiles_y, bool for_backward) {
     const Workers workers;
@@ -122,12 +122,12 @@ void TileLists::sort(const TileEmitArgs &emitted, const float *depth, const int6
     gaussians_.resize(listed), begin_.resize(int64_t(tiles_x) * tiles_y + 1);
     if (for_backward) instances_.resize(listed);
     begin_.get()[int64_t(tiles_x) * tiles_y] = listed;
-    const int64_t slots = tiles_x + 1 + 8; // eight more, so that two workers never write to one line of a cache
+    const int64_t slots = tiles_x + 1 + 8; // eight more, so that two workers never write to the same cache line
     std::vector<int64_t> longest(size_t(tiles_y), 0), memory(size_t(workers.count() * slots));
     auto sort_row = [&](int64_t row, int64_t, int worker) {
         const Rows::Run *runs = rows.runs.get();
         const int64_t begin = rows.begin[size_t(row)], end = rows.begin[size_t(row) + 1];
-        int64_t *next = memory.data() + worker * slots; // how many more than in the tile before, then where the next goes
+        int64_t *next = memory.data() + worker * slots; // difference to the previous tile, then the place of the next instance
         std::fill_n(next, tiles_x + 1, 0);
         for (int64_t k = begin; k < end; ++k) ++next[runs[k].begin], --next[runs[k].end];
         int64_t here = 0, to = rows.instances_begin[size_t(row)];

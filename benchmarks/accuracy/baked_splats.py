@@ -1,9 +1,9 @@
-"""What an exported PLY loses: its display colors, blended as other viewers do, against our final picture.
+"""Measure the loss of an exported PLY: its display colors in other viewers against our final picture.
 
     python benchmarks/accuracy/baked_splats.py RUN [RUN/export/splats.ply]
 
-Means over the test views, of shown pictures, in dB: of the file, and of the diffuse layer alone. Without a second
-argument it takes the PLY that training wrote, which is the same.
+Prints means over the test views in dB, for display pictures of the file and of the diffuse layer alone. The default
+file is the PLY of the training, which is equal to the exported one.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from polarguide.runs.folder import PLY
 
 
 def psnr(a: torch.Tensor, b: torch.Tensor) -> float:
-    """Of two pictures in [0, 1], dB."""
+    """Return the PSNR of two pictures in [0, 1] in dB."""
     return float(-10 * torch.log10(((a - b) ** 2).mean().clamp(min=1e-10)))
 
 

@@ -1,12 +1,12 @@
-"""Base color of exported models against the true one, and roughness: PSNR of sRGB values, of dielectrics, on held-out
-views; the median of glTF's roughness beside the true one.
+"""Compare base color and roughness of exported models with the ground truth.
 
     python benchmarks/accuracy/base_color.py RUN MODEL.glb [MODEL.glb ...]
 
-RUN's scene is one that ``polarguide synth`` has rendered with ``albedo`` in its ground truth; the models are exports of
-RUN in the scene's own units. Rays from the test views look the texture up in the file, as a viewer would. One factor
-is fitted for each model, never one a channel, since the brightness of base color is not known without it. Pixels count
-in the foreground, two pixels off outlines. Needs trimesh and embreex.
+Prints the PSNR of sRGB values on dielectrics in held-out views, and the median of glTF's roughness next to the true
+one. RUN's scene is rendered by ``polarguide synth`` with ``albedo`` in its ground truth. The models are exports of RUN
+in the scene's own units. Rays from the test views look up the texture in the file, as a viewer does. Each model has
+one fitted factor for all channels, because the brightness of base color is ambiguous. Valid pixels are in the
+foreground, two pixels away from outlines. Needs trimesh and embreex.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from polarguide.geometry.camera import Camera
 from polarguide.optics.color import srgb_decode_array, srgb_encode_array
 
 OUTLINE = 5
-"""Pixels of the window in which all have to show one object."""
+"""Side of the window in pixels that must show a single object."""
 
 
 def looked_up(mesh: trimesh.Trimesh, camera: Camera, axes: np.ndarray) -> np.ndarray:
-    """Linear base color and roughness [H, W, 4] of a lit model from a camera of the scene, NaN without a surface."""
+    """Return linear base color and roughness [H, W, 4] of a model from a camera of the scene, NaN without a surface."""
     rays = camera.world_rays(dtype=torch.float64).reshape(-1, 3).numpy() @ axes
     starts = np.broadcast_to(camera.center.numpy() @ axes, rays.shape)
     places, ray, face = mesh.ray.intersects_location(starts, rays, multiple_hits=False)
@@ -42,7 +42,7 @@ def looked_up(mesh: trimesh.Trimesh, camera: Camera, axes: np.ndarray) -> np.nda
     size = image.shape[0]
     places_in_texture = (
         np.stack([(1 - uv[:, 1]) * size, uv[:, 0] * size]) - 0.5
-    )  # trimesh counts v from below
+    )  # trimesh counts v from the bottom
     colors = np.full((len(rays), 4), np.nan)
     for channel in range(4):
         colors[ray, channel] = map_coordinates(
@@ -52,13 +52,13 @@ def looked_up(mesh: trimesh.Trimesh, camera: Camera, axes: np.ndarray) -> np.nda
 
 
 def psnr(first: np.ndarray, second: np.ndarray) -> float:
-    """In dB, of linear colors as sRGB shows them."""
+    """Return the PSNR of linear colors in dB, in sRGB."""
     shown = [srgb_encode_array(np.clip(values, 0, 1)) for values in (first, second)]
     return float(-10 * np.log10(np.mean((shown[0] - shown[1]) ** 2)))
 
 
 def main() -> None:
-    """Print a table: each model, then its objects."""
+    """Print a table of each model and its objects."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("run", type=Path)
     parser.add_argument("models", type=Path, nargs="+")
@@ -66,7 +66,7 @@ def main() -> None:
     run = open_run(arguments.run)
     axes = run.frame.panorama_axes().numpy()
     names = {thing.id: thing.name for thing in run.scene.objects if thing.foreground}
-    print(f"{'model':32} {'as it is':>9} {'1 factor':>9} {'factor':>7}  objects with that factor")
+    print(f"{'model':32} {'factor 1':>9} {'best':>9} {'factor':>7}  objects with that factor")
     for path in arguments.models:
         mesh = trimesh.load(path, process=False).to_geometry()
         model, true, which, rough = [], [], [], []

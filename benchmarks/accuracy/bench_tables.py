@@ -1,7 +1,7 @@
-"""Short Markdown tables of a bench's records: every row by scene, what polarization buys, and errors by object.
+"""Write short Markdown tables of a bench's records: rows by scene, gain by polarization, and errors by object.
 
-The tables of polarguide bench and polarguide tables have every metric; these have the nine that the documentation
-shows. Records of the same code and options, one or more scenes each.
+The tables of polarguide bench and polarguide tables contain every metric. These tables contain the nine metrics of the
+documentation. The records have the same code and options, with one or more scenes each.
 
     python benchmarks/accuracy/bench_tables.py benchmarks/results/bench/*.json > tables.md
 """
@@ -46,22 +46,22 @@ Rows = Mapping[str, Seeds]
 
 
 def values(seeds: Seeds, value: Value) -> dict[int, float]:
-    """What the seeds that have a value have, by seed."""
+    """Return the values of a metric by seed, for seeds with a value."""
     return {seed: found for seed, run in seeds.items() if (found := value(run)) is not None}
 
 
 def of_run(key: str) -> Value:
-    """A metric of a run."""
+    """Return a function that reads a metric of a run."""
     return lambda run: run["metrics"].get(key)
 
 
 def of_object(name: str, key: str) -> Value:
-    """A metric of an object of a run."""
+    """Return a function that reads a metric of an object of a run."""
     return lambda run: run["objects"].get(name, {"metrics": {}})["metrics"].get(key)
 
 
 def number(key: str, known: list[float]) -> str:
-    """Mean, and the standard deviation of several, as tables have them."""
+    """Format a mean, with the standard deviation of several values."""
     metric = BY_KEY[key]
     if not known:
         return "n/a"
@@ -70,7 +70,7 @@ def number(key: str, known: list[float]) -> str:
 
 
 def better_control(key: str, rows: Rows, value: Value) -> str | None:
-    """The control that is better in a metric; None where neither has it."""
+    """Return the control that is better in a metric; None without a value."""
     means = {
         name: statistics.fmean(v) for name in CONTROLS if (v := values(rows.get(name, {}), value).values())
     }
@@ -79,7 +79,7 @@ def better_control(key: str, rows: Rows, value: Value) -> str | None:
 
 
 def gain(key: str, rows: Rows) -> str:
-    """The recipe less the better of its controls, with the 95 % interval over common seeds."""
+    """Format the difference of the recipe to the better of its controls, with the 95 % interval over common seeds."""
     value = of_run(key)
     control = better_control(key, rows, value)
     if control is None:
@@ -99,7 +99,7 @@ def gain(key: str, rows: Rows) -> str:
 
 
 def scene_table(rows: Rows) -> Iterator[str]:
-    """Every recipe of a scene."""
+    """Yield a table of all recipes of a scene."""
     shown = [key for key in COLUMNS if any(values(seeds, of_run(key)) for seeds in rows.values())]
     yield f"| recipe | {' | '.join(COLUMNS[key] for key in shown)} | seeds |"
     yield f"|---|{'---:|' * (len(shown) + 1)}"
@@ -109,7 +109,7 @@ def scene_table(rows: Rows) -> Iterator[str]:
 
 
 def mean_table(scenes: Mapping[str, Rows]) -> Iterator[str]:
-    """Every recipe over all scenes, one weight each; a column over the scenes where all that have it at all do."""
+    """Yield a table of all recipes over all scenes with equal weights. Each column has the scenes of all recipes."""
     names = dict.fromkeys(name for rows in scenes.values() for name in rows)
     yield f"| recipe | {' | '.join(COLUMNS.values())} |"
     yield f"|---|{'---:|' * len(COLUMNS)}"
@@ -123,7 +123,7 @@ def mean_table(scenes: Mapping[str, Rows]) -> Iterator[str]:
 
 
 def gain_table(scenes: Mapping[str, Rows]) -> Iterator[str]:
-    """What polarization buys on each scene."""
+    """Yield a table of the gain by polarization on each scene."""
     columns = {**COLUMNS, **WITHOUT_METALS}
     yield f"| scene | {' | '.join(columns.values())} |"
     yield f"|---|{'---|' * len(columns)}"
@@ -133,7 +133,7 @@ def gain_table(scenes: Mapping[str, Rows]) -> Iterator[str]:
 
 
 def object_table(rows: Rows) -> Iterator[str]:
-    """Objects of a scene: the baseline, the better of the controls, and the recipe."""
+    """Yield a table of the objects of a scene: the baseline, the better of the controls, and the recipe."""
     yield f"| object | material | {' | '.join(BY_KEY[key].heading for key in OBJECT_METRICS)} |"
     yield f"|---|---|{'---|' * len(OBJECT_METRICS)}"
     for name, part in next(iter(rows[RECIPE].values()))["objects"].items():
@@ -148,10 +148,10 @@ def object_table(rows: Rows) -> Iterator[str]:
 
 
 def read_scenes(paths: list[Path]) -> dict[str, dict[str, dict[int, Any]]]:
-    """The finished runs of all records, by scene, recipe and seed, in the order of the records.
+    """Return the finished runs of all records by scene, recipe and seed, in the order of the records.
 
     Raises:
-        PolarguideError: a file that is no record.
+        PolarguideError: a file is not a record.
     """
     scenes: dict[str, dict[str, dict[int, Any]]] = {}
     for path in paths:
@@ -175,7 +175,7 @@ def main() -> None:
     except PolarguideError as error:
         parser.error(str(error))
     print("## Mean over scenes\n", *mean_table(scenes), sep="\n", end="\n\n")
-    print("## What polarization buys\n", *gain_table(scenes), sep="\n", end="\n\n")
+    print("## Gain by polarization\n", *gain_table(scenes), sep="\n", end="\n\n")
     for scene, rows in scenes.items():
         print(f"## {scene}\n", *scene_table(rows), sep="\n", end="\n\n")
         if RECIPE in rows:

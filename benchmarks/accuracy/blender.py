@@ -1,13 +1,15 @@
-"""How exported models look in Blender (Cycles, on the CPU) from held-out cameras, against the photographs.
+"""Compare exported models in Blender (Cycles, on the CPU) from held-out cameras with the photographs.
 
-    python3.11 -m venv ENV && ENV/bin/pip install bpy==5.0.1          # 1 GB, in an environment of its own
+    python3.11 -m venv ENV && ENV/bin/pip install bpy==5.0.1          # 1 GB, in its own environment
     python benchmarks/accuracy/blender.py RUN MODEL.glb [MODEL.usdz ...] --bpy ENV/bin/python [--room SCENE]
 
-The models are exports of RUN in the scene's own units. They are lit by the run's exported environment, or with --room
-by that of a scene which ``polarguide synth`` has rendered with the same things and cameras in another room, whose
-pictures they are compared with. PSNR is of sRGB values in the mask of the foreground: as it is, and with the factor on
-the light that is best for all views, since its brightness is not known. Files with "unlit" in their names are drawn
-without light. "not black" is of dielectrics with an albedo above 0.05, with their own best factor.
+The models are exports of RUN in the scene's own units. The run's exported environment lights them. With --room, the
+environment of another scene lights them, and its pictures are the reference. ``polarguide synth`` must have rendered
+that scene with the same objects and cameras in another room.
+
+PSNR is of sRGB values in the mask of the foreground, without a factor and with the best factor of the light for all
+views, because the brightness is ambiguous. Files with "unlit" in their names are drawn without light. "not black"
+covers dielectrics with an albedo above 0.05, with their own best factor.
 """
 
 from __future__ import annotations
@@ -25,7 +27,7 @@ import numpy as np
 import torch
 
 from polarguide import open_run
-from polarguide.capture.formats.arrays import read_radiance
+from polarguide.capture.formats.pictures import read_radiance
 from polarguide.geometry.camera import Camera
 from polarguide.optics.color import srgb_encode_array
 from polarguide.results.rendering.relight import write_exr
@@ -34,12 +36,12 @@ from polarguide.visualization import figures
 
 HEIGHT = 512
 BLACK = 0.05
-"""Albedo of bodies of which little more than reflections is seen."""
+"""Albedo under which bodies show little more than reflections."""
 FACTORS = np.exp(np.linspace(-1.5, 1.5, 121))
 
 
 def frame_of(camera: Camera, axes: np.ndarray) -> dict[str, Any]:
-    """A camera as Blender takes it: its pose in OpenGL's axes, lens and shift in widths of the picture."""
+    """Return a camera for Blender: its pose in OpenGL's axes, its lens, and its shift in widths of the picture."""
     pose = np.eye(4)
     pose[:3, :3] = axes.T @ camera.rotation.T.numpy() @ np.diag([1.0, -1.0, -1.0])
     pose[:3, 3] = axes.T @ camera.center.numpy()
@@ -54,7 +56,7 @@ def frame_of(camera: Camera, axes: np.ndarray) -> dict[str, Any]:
 
 
 def room_light(scene: Path, axes: np.ndarray) -> torch.Tensor:
-    """The panorama [H, 2 H, 3] of a rendered scene's true environment, upright in a run's axes (columns of [3, 3])."""
+    """Return the panorama [H, 2 H, 3] of a scene's true environment, upright in a run's axes (columns of [3, 3])."""
     exposure = json.loads((scene / "scene.json").read_text())["exposure"]
     true = read_radiance(scene / "environment.hdr") * exposure / 2  # photographs are S0 / 2
     height, width = true.shape[:2]
@@ -70,25 +72,25 @@ def room_light(scene: Path, axes: np.ndarray) -> torch.Tensor:
 
 
 def psnr(first: np.ndarray, second: np.ndarray) -> float:
-    """In dB, of linear colors as sRGB shows them."""
+    """Return the PSNR of linear colors in dB, in sRGB."""
     shown = [srgb_encode_array(np.clip(values, 0, 1)) for values in (first, second)]
     return float(-10 * np.log10(np.mean((shown[0] - shown[1]) ** 2)))
 
 
 def best_factor(first: np.ndarray, second: np.ndarray) -> tuple[float, float]:
-    """The PSNR with the best of the factors on the first, and that factor."""
+    """Return the PSNR with the best of the factors on the first picture, and that factor."""
     return max((psnr(factor * first, second), float(factor)) for factor in FACTORS)
 
 
 def chosen(found: list[np.ndarray], true: list[np.ndarray], masks: list[np.ndarray]) -> list[np.ndarray]:
-    """Both with all pixels of the masks in one row, [N, 3]."""
+    """Return all masked pixels of both pictures in one row, [N, 3]."""
     return [np.concatenate([p[m] for p, m in zip(each, masks, strict=True)]) for each in (found, true)]
 
 
 def drawn(
     path: Path, folder: Path, frames: dict[str, Any], arguments: argparse.Namespace
 ) -> list[np.ndarray]:
-    """Blender's pictures [H, W, 3] of a model, of linear radiance; the folder has the light, and gets files."""
+    """Return Blender's pictures [H, W, 3] of a model in linear radiance. The folder has the light, and gets files."""
     job = {"model": str(path.resolve()), "environment": str(folder / "environment.exr"),
            "unlit": "unlit" in path.stem, "samples": arguments.samples, "frames": frames,
            "out": str(folder)}  # fmt: skip
@@ -101,7 +103,7 @@ def drawn(
 
 
 def main() -> None:
-    """Print a table: each model, and our own pictures where the light is that of the run."""
+    """Print a table of all models, and of our own pictures in the light of the run."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("run", type=Path)
     parser.add_argument("models", type=Path, nargs="+")
@@ -135,7 +137,7 @@ def main() -> None:
         else:
             run.export("environment", folder)
         frames = {view.name: frame_of(view.camera, axes) for view in views}
-        print(f"{'model':32} {'as it is':>9} {'1 factor':>9} {'factor':>7} {'not black':>9}")
+        print(f"{'model':32} {'factor 1':>9} {'best':>9} {'factor':>7} {'not black':>9}")
         for path in arguments.models:
             found = drawn(path, folder, frames, arguments)
             label = f"{path.parent.name}/{path.name}"

@@ -1,4 +1,4 @@
-"""What ``blender.py`` runs in the environment that has bpy: draws a model from cameras into EXR files of radiance."""
+"""Draw a model from cameras into EXR files of radiance. ``blender.py`` runs this in the environment with bpy."""
 
 import json
 import math
@@ -12,7 +12,7 @@ UPRIGHT = Matrix(((1, 0, 0, 0), (0, 0, -1, 0), (0, 1, 0, 0), (0, 0, 0, 1)))  # +
 
 
 def set_light(scene, environment: str, *, unlit: bool) -> None:
-    """A panorama as the world's light, its middle toward glTF's -z; black where the model gives its own color."""
+    """Set a panorama as the world's light, with its center toward glTF's -z; black if the model has its own color."""
     scene.world = bpy.data.worlds.new("world")
     scene.world.use_nodes = True
     nodes, links = scene.world.node_tree.nodes, scene.world.node_tree.links
@@ -23,14 +23,14 @@ def set_light(scene, environment: str, *, unlit: bool) -> None:
     texture, place = nodes.new("ShaderNodeTexEnvironment"), nodes.new("ShaderNodeMapping")
     texture.image = bpy.data.images.load(environment)
     texture.image.colorspace_settings.name = "Linear Rec.709"
-    place.inputs["Rotation"].default_value = (0, 0, -math.pi / 2)  # the middle is +x there
+    place.inputs["Rotation"].default_value = (0, 0, -math.pi / 2)  # Blender has the center at +x
     links.new(nodes.new("ShaderNodeTexCoord").outputs["Generated"], place.inputs["Vector"])
     links.new(place.outputs["Vector"], texture.inputs["Vector"])
     links.new(texture.outputs["Color"], background.inputs["Color"])
 
 
 def main() -> None:
-    """Draw the job that the command line names."""
+    """Draw the job of the command line."""
     job = json.loads(Path(sys.argv[1]).read_text())
     bpy.ops.wm.read_factory_settings(use_empty=True)
     scene = bpy.context.scene

@@ -1,8 +1,9 @@
-"""Errors of DoLP and AoLP before and after ``calibrate``, on a simulated sensor with made errors.
+"""Measure errors of DoLP and AoLP before and after ``calibrate``, on a simulated sensor.
 
-Extinction ratios of 20 to 300, angles up to 2 degrees off, gains of +-3 %: by place in the pattern (smooth over the
-sensor) or of every pixel by itself. The shots have the noise of 10,000 electrons at full scale; the light measured
-afterwards has none, so that what is left is the error of the calibration. One row a way of calibrating.
+The sensor has extinction ratios of 20 to 300, angle errors up to 2 degrees and gains of +-3 %. They depend on the
+place in the pattern (smoothly over the sensor) or are independent for each pixel. The shots have the noise of 10,000
+electrons at full scale. The light of the test has no noise, so the remaining error is that of the calibration. Each
+kind of calibration is a row.
 
     python benchmarks/accuracy/calibrated_sensor.py [--dolp 0.1] [--seeds 3]
 """
@@ -40,7 +41,7 @@ WAYS = {
 
 
 def errors(sensor: MadeSensor, calibration: AnalyzerCalibration | None, dolp: float) -> tuple[float, float]:
-    """Mean errors of DoLP and of AoLP (degrees) over the sensor and over light of all angles."""
+    """Return mean errors of DoLP and of AoLP (degrees) over the sensor and over light of all angles."""
     wrong, turned = [], []
     for degrees in range(0, 180, 10):
         seen = sensor.sees(0.5 * polarizer_light(degrees) * [1, dolp, dolp]).astype(np.float32)
@@ -87,7 +88,7 @@ def main() -> None:
 
 
 def speed() -> None:
-    """Seconds of a first and of a second application to a mosaic of 2448x2048 pixels."""
+    """Return the seconds of a first and of a second application to a mosaic of 2448x2048 pixels."""
     rng = np.random.default_rng(0)
     for block in (32, 2):
         rows, columns = -(-2048 // block), -(-2448 // block)

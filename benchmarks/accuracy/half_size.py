@@ -1,8 +1,8 @@
-"""What bringing the four angles of a cell to one place is worth: half-size pictures against the truth.
+"""Measure the gain from aligning the four angles of a cell, on half-size pictures against the ground truth.
 
-The pictures of a capture are taken for what a sensor of their size would have seen everywhere at every angle. They
-are mosaicked with shot noise, developed at half size, and compared with the means over the cells. Errors are means
-over views: of the DoLP where S0 exceeds 0.1, of the AoLP in degrees where the true DoLP exceeds 0.1, too.
+The pictures of a capture stand for the light at every pixel and angle. They are mosaicked with shot noise, developed at
+half size, and compared with the means over the cells. Errors are means over views: of the DoLP on pixels with S0 above
+0.1, and of the AoLP in degrees on pixels whose true DoLP is also above 0.1.
 
     python benchmarks/accuracy/half_size.py CAPTURE [--every 12]
 """
@@ -26,7 +26,7 @@ BORDER = 4
 
 
 def seen(intensities: NDArray[np.float64], pattern: Pattern, rng: np.random.Generator) -> NDArray[np.float32]:
-    """One sample a pixel of [4, H, W, 3], with shot noise."""
+    """Sample one value per pixel of [4, H, W, 3], with shot noise."""
     out = np.empty(intensities.shape[1:3])
     period = pattern.period
     for row, column in np.ndindex(period, period):
@@ -37,7 +37,7 @@ def seen(intensities: NDArray[np.float64], pattern: Pattern, rng: np.random.Gene
 
 
 def errors(found: NDArray[np.floating], true: NDArray[np.floating]) -> tuple[float, float, float]:
-    """DoLP, AoLP in degrees, and PSNR of S0 in dB."""
+    """Return DoLP, AoLP in degrees, and PSNR of S0 in dB."""
     inside = np.s_[:, BORDER:-BORDER, BORDER:-BORDER]
     (i0, i45, i90, i135), (t0, t45, t90, t135) = (side[inside].mean(axis=3) for side in (found, true))
     s0, ground_truth = (i0 + i45 + i90 + i135) / 2, (t0 + t45 + t90 + t135) / 2

@@ -1,10 +1,10 @@
-"""What ``polarguide inspect`` finds in scenes whose faults are planted.
+"""Check the verdicts of ``polarguide inspect`` on scenes with known faults.
 
     python benchmarks/accuracy/inspection_verdicts.py SCENE [SCENE ...]
 
-The eight orders that keep the pairs, a zero turned by 10 degrees, gamma-encoded files, one angle exposed 5 % longer,
-and pictures overexposed three times are made from each scene in memory, and judged by points seen in several views and
-by the pictures alone (no training).
+Each scene is changed in memory: the eight orders with the same pairs, a zero turned by 10 degrees, gamma-encoded files,
+one angle exposed 5 % longer, and threefold overexposure. The verdicts come from points in several views and from the
+pictures alone, without a training.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ Change = Callable[[NDArray[np.float32]], NDArray[np.float32]]
 
 
 def altered(capture: Capture, change: Change) -> Capture:
-    """The capture with other intensities [4, H, W, 3]; what reaches full scale is saturated."""
+    """Return the capture with other intensities [4, H, W, 3]. Values at full scale are saturated."""
     views = []
     for view in capture.views:
         values = change(view.intensities().numpy())
@@ -44,17 +44,17 @@ def altered(capture: Capture, change: Change) -> Capture:
 
 
 def turned(degrees: float) -> Change:
-    """An instrument whose zero lies at ``degrees``: measured angles are smaller by as much."""
+    """Return a change that turns the instrument's zero to ``degrees``. Measured angles decrease by the same amount."""
     return lambda values: oriented(values, Calibration(zero=-degrees))
 
 
 def misnamed(files: tuple[int, int, int, int]) -> Change:
-    """Pictures called 0, 45, 90, 135 that were taken at ``files``."""
+    """Return a change of pictures with the names 0, 45, 90, 135 that were taken at ``files``."""
     return lambda values: values[[ANGLES.index(angle) for angle in files]]
 
 
 def exposed(place: int) -> Change:
-    """One picture exposed 5 % longer."""
+    """Expose one picture 5 % longer."""
     gains = np.ones((4, 1, 1, 1), np.float32)
     gains[place] = 1.05
     return lambda values: values * gains

@@ -1,10 +1,10 @@
-"""How far an exported mesh lies from the true surface: its depth on test views against the ground truth.
+"""Compare the depth of an exported mesh on test views with the ground truth.
 
     python benchmarks/accuracy/mesh_depth.py RUN MESH.ply
 
-Needs trimesh with a ray engine (``pip install embreex``). Errors are in percent of the scene's extent, 1.1 times the
-largest distance of a camera from the cameras' mean; "rendered" is the depth of the Gaussians themselves, alpha blended.
-A mesh that was exported with an up axis or a scale is taken back to the scene's axes and units, by what its file says.
+Needs trimesh with a ray engine (``pip install embreex``). Errors are in percent of the scene's extent, which is 1.1
+times the largest distance of a camera from the cameras' mean. "rendered" is the blended depth of the Gaussians. A mesh
+with an up axis or a scale in its file is converted to the scene's axes and units.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from polarguide.visualization import figures
 
 
 def scene_mesh(path: Path) -> trimesh.Trimesh:
-    """The mesh of a PLY file of ``polarguide export``, in the axes and units of the scene that it was exported from."""
+    """Return the mesh of a PLY file of ``polarguide export``, in the axes and units of its scene."""
     mesh = trimesh.load(path, process=False)
     file = PlyData.read(path)
     lines = [*file.comments, *(line for element in file.elements for line in element.comments)]
@@ -37,7 +37,7 @@ def scene_mesh(path: Path) -> trimesh.Trimesh:
 
 
 def mesh_depth(mesh: trimesh.Trimesh, camera, step: int) -> np.ndarray:
-    """Camera depth where the rays of every ``step``-th pixel first meet the mesh, NaN where they do not."""
+    """Return the camera depth of the first hit of each ``step``-th pixel's ray with the mesh, NaN for a miss."""
     rays = camera.rays(dtype=torch.float64)[::step, ::step]
     ways = camera.to_world(rays).reshape(-1, 3).numpy()
     start = np.broadcast_to(camera.center.numpy(), ways.shape)
@@ -48,7 +48,7 @@ def mesh_depth(mesh: trimesh.Trimesh, camera, step: int) -> np.ndarray:
 
 
 def pictures(mesh: trimesh.Trimesh, camera) -> np.ndarray:
-    """The mesh from a camera, colors and normals side by side, uint8 RGB."""
+    """Render colors and normals of the mesh from a camera, side by side, uint8 RGB."""
     ways = camera.to_world(camera.rays(dtype=torch.float64)).reshape(-1, 3).numpy()
     start = np.broadcast_to(camera.center.numpy(), ways.shape)
     places, which, faces = mesh.ray.intersects_location(start, ways, multiple_hits=False)
@@ -62,7 +62,7 @@ def pictures(mesh: trimesh.Trimesh, camera) -> np.ndarray:
 
 
 def main() -> None:
-    """Print the median errors of each test view and of all."""
+    """Print the median errors of each test view and of all views."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("run", type=Path)
     parser.add_argument("mesh", type=Path)
@@ -89,7 +89,7 @@ def main() -> None:
             errors[name].append(np.abs(depth - true)[hit] * 100 / extent)
         missing.append(float((known & np.isnan(ours)).sum() / known.sum()))
         medians = ", ".join(f"{name} {np.median(values[-1]):.3f} %" for name, values in errors.items())
-        print(f"{view.name}: median {medians}; no mesh in {100 * missing[-1]:.1f} % of the foreground")
+        print(f"{view.name}: median {medians}; no mesh on {100 * missing[-1]:.1f} % of the foreground")
     for name, values in errors.items():
         joined = np.concatenate(values)
         print(

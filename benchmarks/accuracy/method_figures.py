@@ -1,9 +1,9 @@
-"""Figures of docs/explanation/method.md, drawn by the functions that train.
+"""Draw the figures of docs/explanation/method.md with the functions of the training.
 
     python benchmarks/accuracy/method_figures.py
 
 Writes docs/images/method-dolp.png (Fresnel's equations over the zenith), method-ambiguity.png (the candidates of a
-pixel, and what a guide makes of them) and method-separation.png (the layers of a measured view beside the true ones).
+pixel, and the choice of a guide) and method-separation.png (the layers of a measured view next to the true layers).
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from polarguide.visualization.figures import aolp_to_rgb, radiance_to_rgb
 
 IMAGES = Path(__file__).resolve().parents[2] / "docs" / "images"
 VIEW, DEGREE, INDEX = "v022", 0.2, 1.5
-"""View of the demo scene; degree of polarization whose zeniths are marked; refractive index."""
+"""View of the demo scene; degree of polarization with marked zeniths; refractive index."""
 TILT = 0.35
-"""The guide of the example is the true normal, turned by this angle (20 degrees) about the picture's vertical axis."""
+"""Angle between the example's guide and the true normal, about the picture's vertical axis (20 degrees)."""
 FAINT = 0.03
-"""DoLP under which the example shows no azimuth."""
+"""DoLP below which the example has no azimuth."""
 
 
 def save(figure: Figure, name: str) -> None:
@@ -38,7 +38,7 @@ def save(figure: Figure, name: str) -> None:
 
 
 def draw_dolp() -> None:
-    """DoLP of both lobes over the zenith, and the three zeniths that one degree has."""
+    """Draw the DoLP of both lobes over the zenith, and the three zeniths of one degree."""
     figure, axis = pyplot.subplots(figsize=(6.4, 3.1), layout="constrained")
     zenith = torch.linspace(0, torch.pi / 2, 400, dtype=torch.float64)
     below, above = pg.optics.specular_zeniths(torch.tensor(DEGREE, dtype=torch.float64), INDEX)
@@ -63,7 +63,7 @@ def draw_dolp() -> None:
 
 
 def draw_candidates(axis: Axes, stokes: Tensor, guide: Tensor, ray: Tensor) -> None:
-    """The six candidates of a pixel, seen along its ray: angle is the azimuth, radius the zenith."""
+    """Draw the six candidates of a pixel along its ray: angle is the azimuth, radius the zenith."""
     found = pg.optics.physical_candidates(stokes, ray, INDEX)
     chosen = int(pg.optics.disambiguate(found, guide, ray, azimuth_weight=1.0).choice)
     azimuth, zenith = pg.optics.azimuth(found.normals, ray), pg.optics.zenith(found.normals, ray).rad2deg()
@@ -80,7 +80,7 @@ def draw_candidates(axis: Axes, stokes: Tensor, guide: Tensor, ray: Tensor) -> N
 
 
 def draw_ambiguity(view: View) -> None:
-    """Six candidates of a pixel; the azimuth that the AoLP leaves open, as a guide settles it, and the true one."""
+    """Draw the six candidates of a pixel; the ambiguous azimuth, the choice of a guide, and the true azimuth."""
     rays, truth = view.camera.rays(), view.ground_truth
     assert truth is not None
     assert truth.normal is not None
@@ -96,7 +96,7 @@ def draw_ambiguity(view: View) -> None:
     shown = truth.mask & (pg.optics.dolp(stokes) > FAINT)
 
     def hue(azimuth: Tensor) -> Tensor:
-        """A whole turn of hues."""
+        """Return hues of a full turn."""
         return aolp_to_rgb(azimuth / 2, shown.to(azimuth))
 
     angle = pg.optics.aolp(stokes)
@@ -135,11 +135,11 @@ def draw_ambiguity(view: View) -> None:
 
 
 PIXEL = (30, 50)
-"""Row and column of the pixel whose candidates are drawn: on the black ball."""
+"""Row and column of the pixel of the candidates, on the black ball."""
 
 
 def draw_separation(view: View) -> None:
-    """What the exact solution makes of one view with the true normals, beside the true layers."""
+    """Draw the exact solution for one view with the true normals, next to the true layers."""
     truth, rays = view.ground_truth, view.camera.rays()
     assert truth is not None
     assert truth.normal is not None

@@ -1,17 +1,17 @@
-"""Does polarization ever hurt? A recipe of a bench's records against the best row without polarization.
+"""Check that polarization never hurts: compare a recipe of a bench's records with the best row without polarization.
 
-Each metric of a scene is compared with the row without polarization that is best in it there (the baselines named by
---against and the recipe's controls). A difference of means over seeds is a loss where it is below -0.15 dB (picture,
-foreground), -0.2 dB (layers) or above +0.3 degrees, even with twice its standard error over common seeds in its favor
-(at most 0.1 dB or 0.2 degrees, and that much of fewer than two common seeds). Scenes with metals are judged by object,
-metals by picture and normals alone. How many losses each of the rows without polarization has by the same rule, against
-the best of the others, says how much is to be expected of a best of several. Then come the gains over all scenes,
-views with haze or fog, and views of which more is drawn from behind the true surface than in the best row without
-polarization.
+Each metric of a scene is compared with the best row without polarization in that metric: the baselines of --against and
+the recipe's controls. The comparison is of means over seeds, with a benefit of doubt of twice the standard error over
+common seeds. That benefit is at most 0.1 dB or 0.2 degrees, and has this size for fewer than two common seeds. A
+difference is a loss below -0.15 dB (picture, foreground), below -0.2 dB (layers), or above +0.3 degrees.
+
+Scenes with metals are compared by object, and metals only by picture and normals. For comparison, the losses of each
+row without polarization are counted by the same rule against the best of the others. Further tables show the gains
+over all scenes, views with haze or fog, and views that show more from behind the true surface than the best other row.
 
     python benchmarks/accuracy/never_hurts.py benchmarks/results/bench/*.json
 
-Ends with status 1 where there is a loss.
+The exit status is 1 after a loss.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ PICTURE = {"psnr": 0.15, "psnr_foreground": 0.15}
 LAYERS = {"specular_psnr": 0.2, "diffuse_psnr": 0.2}
 NORMALS = {"normal_mae_deg": 0.3}
 ALLOWED = {**PICTURE, **NORMALS, **LAYERS}
-"""How much worse than the best row without polarization still counts as equal: dB, degrees."""
+"""Tolerated losses against the best row without polarization: dB, degrees."""
 LARGEST_ERROR = {"dB": 0.1, "deg": 0.2}
 MOST_HAZE = 0.01
 MOST_OUTSIDE = 0.01
@@ -48,7 +48,7 @@ Runs = Mapping[str, Mapping[int, Any]]
 
 @dataclass(frozen=True)
 class Judged:
-    """A metric of a scene, or of an object of it: ours, the best row without polarization, and the difference."""
+    """A metric of a scene or an object: our value, the best row without polarization, and the difference."""
 
     where: str
     key: str
@@ -60,11 +60,11 @@ class Judged:
 
     @property
     def lost(self) -> bool:
-        """Whether it is worse by more than is allowed."""
+        """Return True for a loss beyond the tolerance."""
         return self.gain + self.error < -ALLOWED[self.key]
 
     def line(self) -> str:
-        """As a row of a table."""
+        """Format a row of a table."""
         metric = BY_KEY[self.key]
         cells = [self.where, metric.label, f"{self.ours:.2f}", f"{self.theirs:.2f} `{self.best}`"]
         sign = self.gain if metric.better == "higher" else -self.gain
@@ -72,10 +72,11 @@ class Judged:
 
 
 def judge(where: str, key: str, rows: Runs, recipe: str, others: Sequence[str], value: Any) -> Judged | None:
-    """A metric against the best of the others; None where either has no value.
+    """Compare a metric with the best of the other rows; None without a value.
 
     Args:
-        rows: runs by recipe and seed. value: takes a run, gives its value or None.
+        rows: runs by recipe and seed.
+        value: returns the value of a run or None.
     """
     values = {
         name: {seed: found for seed, run in rows[name].items() if (found := value(run)) is not None}
@@ -100,7 +101,7 @@ def judge(where: str, key: str, rows: Runs, recipe: str, others: Sequence[str], 
 
 
 def scene_runs(record: Mapping[str, Any], scene: str) -> dict[str, dict[int, Any]]:
-    """The finished runs of a scene by recipe and seed."""
+    """Return the finished runs of a scene by recipe and seed."""
     found: dict[str, dict[int, Any]] = {}
     for run in record["runs"]:
         if run["scene"] == scene and run["state"] == "done":
@@ -109,7 +110,7 @@ def scene_runs(record: Mapping[str, Any], scene: str) -> dict[str, dict[int, Any
 
 
 def judged_scene(scene: str, rows: Runs, recipe: str, others: Sequence[str]) -> Iterator[Judged]:
-    """Every comparison of a scene; of one with metals, of its objects and of the whole picture."""
+    """Return all comparisons of a scene. A scene with metals is compared by object and as a whole picture."""
     parts = next(iter(rows[recipe].values()))["objects"]
     metals = any(part["material"] in METALS for part in parts.values())
     for key in PICTURE if metals else ALLOWED:
@@ -129,7 +130,7 @@ def judged_scene(scene: str, rows: Runs, recipe: str, others: Sequence[str]) -> 
 
 
 def all_judged(scenes: Mapping[str, Runs], recipe: str, others: Sequence[str]) -> list[Judged]:
-    """Every comparison of every scene that has runs of the recipe."""
+    """Return all comparisons of all scenes with runs of the recipe."""
     return [
         found
         for scene, rows in scenes.items()
@@ -139,7 +140,7 @@ def all_judged(scenes: Mapping[str, Runs], recipe: str, others: Sequence[str]) -
 
 
 def mean_gains(scenes: Mapping[str, Runs], recipe: str, other: str) -> str:
-    """What the recipe has over another on average: geometric mean of normals, layers without the pixels of metals."""
+    """Format the mean gain of the recipe: geometric mean of normals, layers without the pixels of metals."""
 
     def mean(key: str, combine: Callable[[float, float], float]) -> float:
         gains = []
@@ -166,7 +167,7 @@ def mean_gains(scenes: Mapping[str, Runs], recipe: str, other: str) -> str:
 
 
 def bad_views(scene: str, rows: Runs, recipe: str) -> Iterator[str]:
-    """Views with haze, with fog outside the mask, or far under plain splatting, a line each."""
+    """Yield a line for each view with haze, with fog outside the mask, or far worse than plain splatting."""
     for seed, run in rows[recipe].items():
         for view, scores in run["views"].items():
             for key, most in (("haze", MOST_HAZE), ("alpha_outside", MOST_OUTSIDE)):
@@ -182,7 +183,7 @@ def bad_views(scene: str, rows: Runs, recipe: str) -> Iterator[str]:
 
 
 def drawn_through(scene: str, rows: Runs, recipe: str, others: Sequence[str]) -> Iterator[str]:
-    """Views where more is drawn from behind the true surface than in the best other row, means over seeds."""
+    """Yield views that show more from behind the true surface than the best other row, in means over seeds."""
 
     def beyond(name: str, view: str) -> float | None:
         known = [run["views"][view].get("depth_beyond") for run in rows.get(name, {}).values()]
@@ -228,7 +229,7 @@ def main() -> None:
     for found in judged if options.all else losses:
         print(found.line())
     print(f"\n{len(losses)} of {len(judged)} comparisons on {len(scenes)} scenes are losses.\n")
-    print("| by the same rule | losses | of them pictures | normals | layers |\n|---|---:|---:|---:|---:|")
+    print("| row without polarization | losses | pictures | normals | layers |\n|---|---:|---:|---:|---:|")
     for name in (recipe, *rows_without):
         lost = [f for f in all_judged(scenes, name, [r for r in rows_without if r != name]) if f.lost]
         kinds = [sum(found.key in kind for found in lost) for kind in (PICTURE, NORMALS, LAYERS)]

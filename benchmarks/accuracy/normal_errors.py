@@ -1,8 +1,8 @@
-"""Where the normal error of runs is: ``python benchmarks/accuracy/normal_errors.py RUN...`` (scenes with ground truth).
+"""Locate the normal errors of runs on scenes with ground truth: ``python benchmarks/accuracy/normal_errors.py RUN...``.
 
-Foreground pixels of the held-out views are parted into those within two pixels of the foreground's border or of a jump
-of the true normals (neighbors more than 26 degrees apart), and the rest, by degree of polarization. For each part: its
-share of the pixels, its mean error in degrees, its share of the whole error.
+Foreground pixels of the held-out views are divided into edges and the rest, and by degree of polarization. Edges are
+within two pixels of the foreground's border or of a jump of the true normals (neighbors more than 26 degrees apart).
+Each part has its share of the pixels, its mean error in degrees, and its share of the total error.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ FAINT = 0.02
 
 
 def near_edges(normals: Tensor, mask: Tensor) -> Tensor:
-    """Within two pixels of the border of ``mask`` [H, W] or of a jump of ``normals`` [H, W, 3]."""
+    """Return the mask of pixels near the border of ``mask`` [H, W] or a jump of ``normals`` [H, W, 3]: two pixels."""
     n = normals.numpy()
     jumps = np.zeros(mask.shape, dtype=np.uint8)
     jumps[:, 1:] |= (n[:, 1:] * n[:, :-1]).sum(axis=-1) < JUMP

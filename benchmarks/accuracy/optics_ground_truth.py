@@ -1,10 +1,10 @@
-"""What the polarization optics achieve on rendered scenes with known normals and layers.
+"""Measure the accuracy of the polarization optics on rendered scenes with known normals and layers.
 
 Usage: python benchmarks/accuracy/optics_ground_truth.py SCENES_DIR [--scenes spheres cup ...] [--refractive-index 1.5]
 
-Each scene folder holds ``polar/VIEW_ANGLE.png`` (linear, 16 bits), ``gt/VIEW.npz`` (world ``normal``,
+Each scene folder contains ``polar/VIEW_ANGLE.png`` (linear, 16 bits), ``gt/VIEW.npz`` (world ``normal``,
 ``mask``, and ``specular`` and ``diffuse`` in units of S0), ``sparse/0`` (COLMAP text) and ``split.json`` with
-the test views. Prints a Markdown table; every figure is a mean over the test views of the scene's foreground.
+the test views. Prints a Markdown table of means over the test views of the scene's foreground.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ WATER_INDEX = 1.33
 
 
 class View(NamedTuple):
-    """One test view: [3, H, W, 3] Stokes, rays and true normals in camera axes, mask, true layers."""
+    """A test view: [3, H, W, 3] Stokes, rays and true normals in camera axes, mask, true layers."""
 
     stokes: Tensor
     rays: Tensor
@@ -40,7 +40,7 @@ class View(NamedTuple):
 
 
 def read_cameras(sparse: Path) -> dict[str, Camera]:
-    """Cameras by view name from a COLMAP text model with one PINHOLE camera."""
+    """Return cameras by view name from a COLMAP text model with one PINHOLE camera."""
     rows = [line for line in (sparse / "cameras.txt").read_text().splitlines() if line[:1] != "#"]
     fields = rows[0].split()
     width, height = int(fields[2]), int(fields[3])
@@ -63,7 +63,7 @@ def read_cameras(sparse: Path) -> dict[str, Camera]:
 
 
 def read_view(scene: Path, name: str, camera: Camera) -> View:
-    """One test view in float64."""
+    """Return a test view in float64."""
     images = [cv2.imread(str(scene / "polar" / f"{name}_{a:03d}.png"), -1) for a in optics.ANGLES]
     intensities = torch.from_numpy(np.stack(images)[..., ::-1] / 65535.0)
     with np.load(scene / "gt" / f"{name}.npz") as ground_truth:
@@ -78,23 +78,23 @@ def read_view(scene: Path, name: str, camera: Camera) -> View:
 
 
 def psnr(layer: Tensor, ground_truth: Tensor, mask: Tensor) -> float:
-    """PSNR in dB of a layer as shown (S/2, sRGB) over the mask."""
+    """Return the PSNR in dB of a layer on display (S/2, sRGB) over the mask."""
     difference = shown(layer[mask] / 2) - shown(ground_truth[mask] / 2)
     return -10 * math.log10(float((difference**2).mean()))
 
 
 def angle(a: Tensor, b: Tensor) -> Tensor:
-    """Angle between unit vectors in degrees."""
+    """Return the angle between unit vectors in degrees."""
     return torch.rad2deg(torch.atan2(torch.linalg.cross(a, b).norm(dim=-1), (a * b).sum(-1)))
 
 
 def fold(difference: Tensor, period: float) -> Tensor:
-    """Size of an angle difference modulo ``period``, in degrees."""
+    """Return the size of an angle difference modulo ``period``, in degrees."""
     return torch.rad2deg(((difference + period / 2) % period - period / 2).abs())
 
 
 def score(view: View, refractive_index: float) -> dict[str, float]:
-    """All figures of one view."""
+    """Return all numbers of one view."""
     luminance = optics.luminance(view.stokes)
     degree, true_zenith = optics.dolp(luminance), optics.zenith(view.normals, view.rays)
     pixels = view.mask & optics.polarization_mask(luminance, threshold=THRESHOLD)
@@ -141,9 +141,9 @@ def score(view: View, refractive_index: float) -> dict[str, float]:
 
 
 def color_scores(view: View, true_zenith: Tensor, refractive_index: float) -> dict[str, float]:
-    """How often and how well the polarization of color differences tells the normal.
+    """Return the frequency and accuracy of normals from the polarization of color differences.
 
-    The half turn that it leaves open is resolved by the true normal, as in the other rows.
+    The true normal resolves the ambiguity of half a turn, as in the other rows.
     """
     found = optics.chromatic_normals(view.stokes, refractive_index)
     where = view.mask & found.decided

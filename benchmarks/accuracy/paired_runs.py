@@ -1,11 +1,11 @@
-"""What one setting is worth, by object: runs with it less runs without it, paired by scene and seed.
+"""Measure the gain of one setting by object: runs with it minus runs without it, paired by scene and seed.
 
     python benchmarks/accuracy/paired_runs.py --runs RUN... --less RUN... [--record FILE]
     python benchmarks/accuracy/paired_runs.py --record FILE
 
-Runs have been scored (``polarguide eval``). Printed are, for each scene as a whole and each of its objects, means of
-the differences with twice their standard error over seeds, the layers' scores, and the share of the object's pixels
-that is called metal in each run. ``--record`` keeps the scores, and prints of them where no runs are given.
+The runs must have scores (``polarguide eval``). For each scene and each of its objects, the table contains means of the
+differences with twice their standard error over seeds, and the scores of the layers. It also contains the share of the
+object's pixels that each run classifies as metal. ``--record`` writes the scores, or reads them without runs.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ WHOLE = "all"
 DIELECTRICS = "layers without metals"
 ONE_PERCENT = 1.0
 Scores = dict[str, dict[str, float | None]]
-"""By object, and of the whole scene."""
+"""Scores by object, and of the whole scene."""
 
 
 def scores_of(run: Path) -> tuple[str, str, Scores]:
-    """Scene and seed of a run, and its scores."""
+    """Return scene and seed of a run, and its scores."""
     metrics = json.loads((run / "metrics.json").read_text(encoding="utf-8"))
     configuration = json.loads((run / "run.json").read_text(encoding="utf-8"))
     keys = (*METRICS, "metal_share")
@@ -40,7 +40,7 @@ def scores_of(run: Path) -> tuple[str, str, Scores]:
 
 
 def collected(runs: Sequence[Path]) -> dict[str, dict[str, Scores]]:
-    """Scores by scene and seed."""
+    """Return scores by scene and seed."""
     found: dict[str, dict[str, Scores]] = {}
     for run in runs:
         scene, seed, scores = scores_of(run)
@@ -49,7 +49,7 @@ def collected(runs: Sequence[Path]) -> dict[str, dict[str, Scores]]:
 
 
 def difference(having: Sequence[Any], lacking: Sequence[Any]) -> str:
-    """Mean of the paired differences, and twice their standard error where there are two or more."""
+    """Format the mean of the paired differences, and twice their standard error for two or more."""
     if None in (*having, *lacking):
         return ""
     apart = np.subtract(having, lacking)
@@ -58,7 +58,7 @@ def difference(having: Sequence[Any], lacking: Sequence[Any]) -> str:
 
 
 def table(having: dict[str, Scores], lacking: dict[str, Scores]) -> list[str]:
-    """The lines of one scene's table, of the seeds that both have."""
+    """Return the lines of one scene's table, for seeds that both have."""
     seeds = sorted(having.keys() & lacking.keys())
     lines = [
         "| | PSNR | normals | specular | diffuse | specular / diffuse | called metal (%) |",

@@ -1,7 +1,7 @@
-"""How far the poses of one scene are from those of another that shows the same views.
+"""Measure the differences between the poses of two scenes with the same views.
 
-The two models are brought together by the similarity that fits the camera centers best in the least-squares sense
-(Umeyama 1991). Positions are relative to the diagonal of the reference's camera path, so that no unit is needed.
+The two models are aligned by the similarity of the camera centers with the least squared error (Umeyama 1991).
+Positions are relative to the diagonal of the reference's camera path, so they need no unit.
 
     python benchmarks/accuracy/pose_error.py SCENE REFERENCE
 """
@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 
 
 def similarity(source: Array, target: Array) -> tuple[float, Array, Array]:
-    """Scale, rotation and translation that carry points [N, 3] to others best."""
+    """Return the scale, rotation and translation that best map points [N, 3] to others."""
     a, b = source - source.mean(0), target - target.mean(0)
     u, spread, vt = np.linalg.svd(b.T @ a / len(a))
     mirror = np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])

@@ -1,10 +1,10 @@
-"""Figures and short tables of docs/results, from the records in benchmarks/results.
+"""Draw figures and short tables of docs/results from the records in benchmarks/results.
 
     python benchmarks/accuracy/result_figures.py            # draws docs/figures/results-*.svg
     python benchmarks/accuracy/result_figures.py --tables   # prints the same values as Markdown
 
-Quality by recipe, by material, by number of views and by polarizer angles of each view. Every point is one scene, the
-mean of its seeds. No record varies the noise of the pictures.
+The figures show quality by recipe, by material, by number of views and by polarizer angles of each view. Each point is
+one scene, the mean of its seeds. No record varies the noise of the pictures.
 """
 
 from __future__ import annotations
@@ -44,10 +44,10 @@ PICTURE = ("psnr", "psnr_foreground")
 NORMALS, LAYERS = ("normal_mae_deg",), ("specular_psnr", "diffuse_psnr")
 DIELECTRIC = ("specular_psnr_dielectric", "diffuse_psnr_dielectric")
 COLORS = ("#777777", "#e69f00", "#0072b2", "#009e73")
-"""Of Okabe and Ito: told apart by color-blind readers, and in gray."""
+"""Colors of Okabe and Ito, distinguishable with color blindness and in gray."""
 STYLE = {
-    "svg.fonttype": "none",  # text stays text: small files that can be searched
-    "svg.hashsalt": "polarguide",  # the same file from the same records
+    "svg.fonttype": "none",  # text stays text: small, searchable files
+    "svg.hashsalt": "polarguide",  # reproducible files
     "font.family": "sans-serif",
     "font.size": 9,
     "axes.spines.top": False,
@@ -61,20 +61,20 @@ Scenes = Mapping[str, Rows]
 
 
 def by_scene(scenes: Scenes, recipe: str, value: Value) -> dict[str, float]:
-    """The mean over seeds of a recipe, by scene; scenes without a value are left out."""
+    """Return the mean over seeds of a recipe by scene. Scenes without a value are left out."""
     means = {scene: list(values(rows.get(recipe, {}), value).values()) for scene, rows in scenes.items()}
     return {scene: statistics.fmean(known) for scene, known in means.items() if known}
 
 
 def of_material(name: str, key: str) -> Value:
-    """A metric over the pixels of a material in a run."""
+    """Return a function that reads a metric over the pixels of a material in a run."""
     return lambda run: (run["materials"] or {}).get(name, {"metrics": {}})["metrics"].get(key)
 
 
 def table(
     corner: str, keys: Sequence[str], rows: Mapping[str, Callable[[str], Mapping[str, float]]]
 ) -> Iterator[str]:
-    """A Markdown table of means over scenes: a row each, its values by scene from a function of the metric."""
+    """Yield a Markdown table of means over scenes, with a row for each function of the metric."""
     yield f"| {corner} | {' | '.join(BY_KEY[key].heading for key in keys)} |"
     yield f"|---|{'---:|' * len(keys)}"
     for name, value in rows.items():
@@ -87,7 +87,7 @@ def table(
 
 
 def panels(keys: Sequence[str], height: float, **options: Any) -> tuple[Figure, list[Axes]]:
-    """A figure as wide as a page's text, with a panel for each metric, named by it."""
+    """Return a figure with the width of a page's text, with a titled panel for each metric."""
     figure, axes = pyplot.subplots(1, len(keys), figsize=(9.6, height), layout="constrained", **options)
     for axis, key in zip(axes, keys, strict=True):
         axis.set_title(BY_KEY[key].heading.replace(" without", "\nwithout"), fontsize=9)
@@ -101,7 +101,7 @@ def save(figure: Figure, name: str) -> None:
 
 
 def draw_recipes(scenes: Scenes) -> None:
-    """The gain of every recipe over the baseline: a dot for each scene, a bar for their mean."""
+    """Draw the gain of each recipe over the baseline: a dot for each scene, a bar for the mean."""
     keys = (*PICTURE, *NORMALS, *DIELECTRIC)
     figure, axes = panels(keys, 3.4, sharey=True)
     for axis, key in zip(axes, keys, strict=True):
@@ -121,7 +121,7 @@ def draw_recipes(scenes: Scenes) -> None:
 
 
 def draw_materials(scenes: Scenes) -> None:
-    """Normals and layers over the pixels of each material, of three recipes."""
+    """Draw normals and layers over the pixels of each material, for three recipes."""
     keys = (*NORMALS, *LAYERS)
     figure, axes = panels(keys, 2.9)
     for axis, key in zip(axes, keys, strict=True):
@@ -142,7 +142,7 @@ def draw_materials(scenes: Scenes) -> None:
 
 
 def draw_views(scenes: Scenes, recipes: Sequence[str]) -> None:
-    """Quality over the number of training views."""
+    """Draw the quality over the number of training views."""
     keys = ("psnr_foreground", *NORMALS, "specular_psnr")
     figure, axes = panels(keys, 2.9)
     counts = [int(scene.removeprefix("views-")) for scene in scenes]
@@ -159,7 +159,7 @@ def draw_views(scenes: Scenes, recipes: Sequence[str]) -> None:
 
 
 def draw_angles(scenes: Scenes) -> None:
-    """Quality over the polarizer angles of each training view: a line for each scene, and their mean."""
+    """Draw the quality over the polarizer angles of each training view: a line for each scene, and their mean."""
     keys = ("psnr_foreground", *NORMALS, *LAYERS)
     figure, axes = panels(keys, 2.8)
     for axis, key in zip(axes, keys, strict=True):
@@ -181,7 +181,7 @@ METALS = {"metals-a": ("jug", "jug_handle", "pot"), "kit": ("lid_blue", "ruler")
 
 
 def draw_constants(scenes: Mapping[str, Mapping[str, Mapping[str, float]]]) -> None:
-    """What is found of each metal, and of the dielectric that is taken for metal most, by the constants of metals."""
+    """Draw the recall of each metal, and the dielectric with most false metal pixels, over the constants of metals."""
     settings = list(next(iter(scenes.values())))
     figure, axes = pyplot.subplots(figsize=(7, 2.8), layout="constrained")
     for scene, names in METALS.items():
@@ -205,7 +205,7 @@ def draw_constants(scenes: Mapping[str, Mapping[str, Mapping[str, float]]]) -> N
 
 
 def tables(bench: Scenes, angles: Scenes) -> Iterator[str]:
-    """The values that the figures by recipe, material and angles show, as Markdown."""
+    """Yield the values of the figures by recipe, material and angles as Markdown."""
     keys = (*PICTURE, *NORMALS, *DIELECTRIC)
     yield "## By recipe\n"
     every = (BASELINE, *RECIPES)

@@ -1,9 +1,9 @@
-"""Raw mosaics as a color polarization sensor would have written them, made from a capture with four pictures a view.
+"""Simulate raw mosaics of a color polarization sensor from a capture with four pictures of each view.
 
-Each picture pixel becomes one 2x2 cell of the sensor, so a capture of 612x512 gives mosaics of 1224x1024: the cell
-takes the one color that its filter passes, and its four samples are the four angles. Nothing is interpolated, so
-what ``prepare`` has to put back is exactly what a sensor leaves out; unlike one, all angles of a cell lie in one place
-(hence ``--no-register``). Values are 12-bit in 16-bit PNG files.
+Each picture pixel becomes one 2x2 cell of the sensor, so a capture of 612x512 gives mosaics of 1224x1024. The cell
+takes the one color of its filter, and its four samples are the four angles. Nothing is interpolated, so ``prepare``
+must restore exactly the values that a sensor misses. Unlike in a real sensor, all angles of a cell have the same
+position (hence ``--no-register``). Values are 12-bit in 16-bit PNG files.
 
     python benchmarks/accuracy/simulated_mosaics.py CAPTURE MOSAICS
     polarguide prepare MOSAICS --out SCENE --sensor IMX250MYR --no-register
@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polarguide.capture.formats.pictures import decode_picture, linear_codes
-from polarguide.capture.layout import Layout, find_layout
+from polarguide.capture.layout import CaptureFiles, find_layout
 from polarguide.capture.sensor.pattern import sensor_pattern
 from polarguide.capture.view import ANGLES
 from polarguide.core.files import read_file
@@ -28,8 +28,8 @@ from polarguide.core.files import read_file
 FULL = 4095
 
 
-def linear_intensities(layout: Layout, view: str, transfer: str) -> NDArray[np.float64]:
-    """Intensities of a view in [0, 1], [4, H, W, 3]."""
+def linear_intensities(layout: CaptureFiles, view: str, transfer: str) -> NDArray[np.float64]:
+    """Return the intensities of a view in [0, 1], [4, H, W, 3]."""
     pictures = (
         decode_picture(path, read_file(path)) for path in (layout.pictures[view][angle] for angle in ANGLES)
     )
@@ -39,7 +39,7 @@ def linear_intensities(layout: Layout, view: str, transfer: str) -> NDArray[np.f
 def mosaic(
     intensities: NDArray[np.float64], *, electrons: float, rng: np.random.Generator
 ) -> NDArray[np.uint16]:
-    """12-bit mosaic [2 H, 2 W] of [4, H, W, 3]; ``electrons`` at full scale for shot noise, 0 for none."""
+    """Return a 12-bit mosaic [2 H, 2 W] of [4, H, W, 3]. ``electrons`` at full scale define shot noise; 0: no noise."""
     _, height, width, _ = intensities.shape
     pattern = sensor_pattern("IMX250MYR")
     assert pattern.colors is not None

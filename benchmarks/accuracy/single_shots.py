@@ -1,19 +1,21 @@
-"""Whether trainings on single shots through a filter burn: brightness and accuracy, view by view.
+"""Measure burnt pixels of trainings on single shots through a filter: brightness and accuracy, view by view.
 
 ``polarguide synth SCENE --sensor filter`` writes both the single shots (``raw``, for ``prepare``) and the scene with
-four exact angles, which is the truth here. For each scene and each kind of knowledge about the angles:
+four exact angles, which is the ground truth here. For each scene and each kind of knowledge about the angles:
 
     polarguide synth cup --out TRUTH --sensor filter --noise 1 --size 320x240 --samples 8 --views 32
+
     polarguide prepare TRUTH/raw --out SHOTS --poses TRUTH
+
     polarguide train SHOTS --out RUN --downscale 2 --steps 2500 --threads 1 --seed 0
     polarguide train TRUTH --out FOUR --downscale 2 --steps 2500 --threads 1 --seed 0
     python benchmarks/accuracy/single_shots.py RUN=TRUTH FOUR=TRUTH ... --json single-shots.json
 
 For unknown angles the files are copied without the angle in their names, and prepared with ``--angles unknown``.
 
-A pixel burns where the light is over twice the brightest value that was measured unclipped in any training view, and
-another training view sees the same place unclipped. Shares are of the pixels of a view, once of ``final`` (S0/2) and
-once of the intensity that is predicted behind the analyzer of the view.
+A pixel burns if its light is more than twice the brightest unclipped value in any training view, and another training
+view measures the same place unclipped. Shares are of the pixels of a view: of ``final`` (S0/2), and of the predicted
+intensity behind the analyzer of the view.
 """
 
 from __future__ import annotations
@@ -35,16 +37,17 @@ from polarguide.runs.opened import OpenedRun
 from polarguide.training.photometric import behind_analyzer
 
 SAME_PLACE = 0.02
-"""Two depths of one place differ by less than this share."""
+"""Largest relative difference of two depths of one place."""
 HIGHLIGHT = 2.0
-"""True S0/2 from which on a place is a highlight, in units of full scale."""
+"""True S0/2 above which a place is a highlight, in units of full scale."""
 
 
 class Burning:
-    """Looks at the views of a run.
+    """Observer of the views of a run.
 
     Args:
-        run: trained on single shots or on four angles. truth: the scene with four exact angles, at the run's size.
+        run: a run on single shots or on four angles.
+        truth: the scene with four exact angles, at the run's size.
     """
 
     def __init__(self, run: OpenedRun, truth: Scene) -> None:
@@ -55,7 +58,7 @@ class Burning:
         self.depth = {view.name: run.model.render(view.camera, depth=True).depth for view in views}
 
     def look(self, view: View) -> dict[str, Any]:
-        """What there is to say of a view: shares that burn, PSNR against the truth, and what becomes of highlights."""
+        """Measure a view: shares of burnt pixels, PSNR against the ground truth, and values of highlights."""
         result = self.run.model.render(view.camera, depth=True)
         assert result.depth is not None
         found: dict[str, Any] = {"final": self.burns(view, result.final, result.depth)}
@@ -76,7 +79,7 @@ class Burning:
         return found
 
     def burns(self, view: View, light: Tensor, depth: Tensor) -> float:
-        """The share of the pixels that burn."""
+        """Return the share of burnt pixels."""
         rows, columns = torch.nonzero(light.amax(dim=-1) > self.limit, as_tuple=True)
         if not len(rows):
             return 0.0
@@ -106,14 +109,14 @@ class Burning:
 
 
 def brightest_unclipped(view: View) -> float:
-    """The largest intensity of the pixels of a view that do not clip."""
+    """Return the largest intensity of the unclipped pixels of a view."""
     clear = ~(view.saturated | view.invalid)
     return float(view.intensities()[:, clear].max()) if bool(clear.any()) else 0.0
 
 
 @torch.no_grad()
 def examine(folder: Path, truth: Path) -> dict[str, Any]:
-    """The record of one run."""
+    """Return the record of one run."""
     run = OpenedRun.open(folder)
     scene = pg.load_scene(truth, downscale=run.configuration.downscale)
     burning = Burning(run, scene)

@@ -1,11 +1,11 @@
-"""How exported splats look in other engines, in a headless Chromium with software WebGL, against our final picture.
+"""Compare exported splats in other engines, in a headless Chromium with software WebGL, with our final picture.
 
     npm install three @babylonjs/core @babylonjs/loaders playcanvas @sparkjsdev/spark esbuild     # anywhere
     pip install '.[browser]'                                               # in polarguide's source folder
     python benchmarks/accuracy/splat_engines.py RUN --node-modules DIR/node_modules --engines three spark
 
-For each test view it prints the PSNR of shown pictures: of the file in the engine, and of the diffuse layer alone,
-which is what a file without baked reflections would show at best.
+Prints the PSNR of display pictures for each test view: of the file in the engine, and of the diffuse layer alone. The
+diffuse layer is the upper bound of a file without baked reflections.
 """
 
 from __future__ import annotations
@@ -50,16 +50,18 @@ DRAWS_WITH_THREE = """
 };
 """
 
-# Each starts with a canvas and a file, and gives a function that draws with a camera: its view and pose (camera to
-# world) in OpenGL's axes, its projection, all as WebGL counts matrices, and its size.
+# Each script gets a canvas and a file, and returns a function that draws a camera. The camera has its view and
+# pose (camera to world) in OpenGL's axes, its projection, all in the matrix order of WebGL, and its size.
 ENGINES = {
     "three": """
 import * as THREE from "three/webgpu";
 import { GLTFLoader } from "three/addons/loaders/GLTFLoader.js";
 import { GLTFGaussianSplatLoaderExtension } from "three/addons/loaders/GLTFGaussianSplatLoaderExtension.js";
+
 export default async (canvas, url) => {
   const renderer = new THREE.WebGPURenderer({ canvas, forceWebGL: true, antialias: false });
   await renderer.init();
+
   const loader = new GLTFLoader().register((parser) => new GLTFGaussianSplatLoaderExtension(parser));
   const scene = new THREE.Scene(), camera = new THREE.PerspectiveCamera();
   scene.background = new THREE.Color(0);
@@ -74,15 +76,19 @@ import { Matrix, Vector3 } from "@babylonjs/core/Maths/math.vector.js";
 import { Color4 } from "@babylonjs/core/Maths/math.color.js";
 import { ImportMeshAsync } from "@babylonjs/core/Loading/sceneLoader.js";
 import "@babylonjs/loaders/glTF/2.0/index.js";
+
 export default async (canvas, url) => {
   const engine = new Engine(canvas, false, { preserveDrawingBuffer: true });
   const scene = new Scene(engine);
   scene.useRightHandedSystem = true;
   scene.clearColor = new Color4(0, 0, 0, 1);
+
   const camera = new FreeCamera("camera", Vector3.Zero(), scene);
   await ImportMeshAsync(url, scene);
+
   return (frame) => {
     engine.setSize(frame.width, frame.height);
+
     camera._getViewMatrix = () => Matrix.FromArray(frame.view);
     camera.position = new Vector3(...frame.pose.slice(12, 15));
     camera.getViewMatrix(true);
@@ -92,6 +98,7 @@ export default async (canvas, url) => {
 };""",
     "playcanvas": """
 import * as pc from "playcanvas";
+
 export default async (canvas, url) => {
   const device = await pc.createGraphicsDevice(canvas, {
     deviceTypes: ["webgl2"], antialias: false, preserveDrawingBuffer: true });
@@ -99,20 +106,24 @@ export default async (canvas, url) => {
   options.graphicsDevice = device;
   options.componentSystems = [pc.RenderComponentSystem, pc.CameraComponentSystem, pc.GSplatComponentSystem];
   options.resourceHandlers = [pc.ContainerHandler, pc.TextureHandler];
+
   const app = new pc.AppBase(canvas);
   app.init(options);
   app.setCanvasFillMode(pc.FILLMODE_NONE);
   app.autoRender = false;
   app.start();
+
   const asset = await new Promise((resolve, reject) =>
     app.assets.loadFromUrl(url, "container", (error, asset) => error ? reject(error) : resolve(asset)));
   app.root.addChild(asset.resource.instantiateRenderEntity());
   const camera = new pc.Entity();
   camera.addComponent("camera", { clearColor: new pc.Color(0, 0, 0, 1) });
   app.root.addChild(camera);
+
   return (frame) => {
     app.resizeCanvas(frame.width, frame.height);
     device.setResolution(frame.width, frame.height);
+
     const pose = new pc.Mat4();
     pose.data.set(frame.pose);
     camera.setPosition(pose.getTranslation());
@@ -125,12 +136,13 @@ export default async (canvas, url) => {
     "spark": """
 import * as THREE from "three";
 import { SparkRenderer, SplatMesh } from "@sparkjsdev/spark";
+
 export default async (canvas, url) => {
   const renderer = new THREE.WebGLRenderer({ canvas, antialias: false, preserveDrawingBuffer: true });
   const scene = new THREE.Scene(), camera = new THREE.PerspectiveCamera();
   scene.add(new SparkRenderer({ renderer, maxStdDev: 3.33, minAlpha: 1 / 255 }));
   const mesh = new SplatMesh({ url });
-  if (url.endsWith(".spz")) mesh.quaternion.set(1, 0, 0, 0);  // from its own axes (right, up, back) to the world's
+  if (url.endsWith(".spz")) mesh.quaternion.set(1, 0, 0, 0);  // own axes (right, up, back) to the world's axes
   scene.add(mesh);
   await mesh.initialized;
 """
@@ -142,13 +154,15 @@ FILES = {
     "playcanvas": ("splat-glb", "splats-srgb.glb"),
     "spark": ("ply", "splats.ply"),
 }
-"""The export that is for an engine, and its file; ``--file`` takes another."""
+"""Export format and file of each engine. ``--file`` replaces it."""
 MAIN = """
 import start from "./engine.js";
 const canvas = document.querySelector("canvas");
-// Sorting happens in a worker, between frames: until the picture has stayed the same for a while.
+
+// A worker sorts between frames. The picture is complete when it has not changed for several frames.
 window.show = async (frame, still, wait) => {
   window.draw ??= await start(canvas, "/" + frame.file);
+
   let now = "";
   for (let same = 0, before = ""; same < still; ) {
     window.draw(frame);
@@ -167,7 +181,7 @@ PAGE = (
 
 
 def frame_of(camera: Camera, axes: torch.Tensor) -> dict[str, Any]:
-    """A camera of the scene for the engines; ``axes`` [3, 3] turns the scene's directions into the file's."""
+    """Return a camera of the scene for the engines. ``axes`` [3, 3] turns the scene's directions into the file's."""
     flip = np.diag([1.0, -1.0, -1.0])
     view = np.eye(4)
     view[:3, :3] = flip @ (camera.rotation @ axes.T).numpy()
@@ -185,7 +199,7 @@ def frame_of(camera: Camera, axes: torch.Tensor) -> dict[str, Any]:
 
 @contextmanager
 def engine_page(engine: str, file: Path, modules: Path, folder: Path) -> Iterator[Any]:
-    """A page of an engine that has ``show``; the file is served under its name."""
+    """Open a page of an engine that has ``show``. The file is served under its name."""
     from playwright.sync_api import sync_playwright
 
     chromium = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
@@ -220,11 +234,13 @@ def engine_page(engine: str, file: Path, modules: Path, folder: Path) -> Iterato
         browser = playwright.chromium.launch(executable_path=chromium, args=FLAGS.split())
         page = browser.new_page()
         page.set_default_timeout(600_000)
-        page.on("pageerror", lambda error: print("in the page:", error))
+        page.on("pageerror", lambda error: print("error in the page:", error))
         page.on(
             "console",
             lambda said: (
-                print("the engine says:", said.text[:200]) if said.type in ("warning", "error") else None
+                print("message of the engine:", said.text[:200])
+                if said.type in ("warning", "error")
+                else None
             ),
         )
         page.route("**/*", answer)
@@ -235,12 +251,12 @@ def engine_page(engine: str, file: Path, modules: Path, folder: Path) -> Iterato
 
 
 def psnr(a: np.ndarray, b: np.ndarray) -> float:
-    """Of two uint8 pictures, dB."""
+    """Return the PSNR of two uint8 pictures in dB."""
     return float(10 * np.log10(255**2 / max(np.mean((a.astype(float) - b) ** 2), 1e-9)))
 
 
 def main() -> None:
-    """Print a line a view and engine, and the means."""
+    """Print a line for each view and engine, and the means."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("run", type=Path)
     parser.add_argument("--node-modules", type=Path, required=True)
@@ -283,7 +299,7 @@ def main() -> None:
                         arguments.pictures.mkdir(parents=True, exist_ok=True)
                         both = np.concatenate((found, expected), axis=1)
                         figures.write_png(arguments.pictures / f"{view.name}_{engine}.png", both)
-            print(f"mean: {path.name} in {engine} {np.mean(scores):.2f} dB, diffuse alone {alone:.2f} dB")
+            print(f"mean: {path.name} in {engine} {np.mean(scores):.2f} dB, diffuse layer {alone:.2f} dB")
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
-"""One value of a baseline changed at a time: what each setting gives on scenes that methods are developed beside.
+"""Tune baselines by changing one value at a time, on the development scenes.
 
-Baselines deserve the search that our recipes had. Each setting is trained at half size, seed 0; what is finished is
-not trained again. A table for each recipe: PSNR / foreground / normal error / specular / diffuse, and the gain in the
-picture over the recipe as it is (mean over scenes, PSNR and foreground, in dB).
+Baselines need the same search as our recipes. Each setting is trained at half size with seed 0. Finished trainings are
+not repeated. Each recipe has a table: PSNR / foreground / normal error / specular / diffuse. It also contains the gain
+in the picture over the unchanged recipe (mean over scenes, PSNR and foreground, in dB).
 
     python benchmarks/accuracy/tune_baselines.py SCENE... --out FOLDER [--recipes 3dgs ...] [--last N] [--steps 1500]
         [--jobs 2]
@@ -34,7 +34,7 @@ AS_IT_IS = "as it is"
 
 
 def rates(recipe: Recipe, **factors: float) -> Recipe:
-    """Some learning rates times a factor."""
+    """Multiply some learning rates by factors."""
     changed = {name: recipe.rates[name] * factor for name, factor in factors.items()}
     return replace(recipe, rates={**recipe.rates, **changed})
 
@@ -62,13 +62,13 @@ def staged(recipe: Recipe, **values: Any) -> Recipe:
 
 
 def resets(recipe: Recipe) -> Recipe:
-    """Opacity is reset where the density is controlled."""
+    """Reset the opacity together with the density control."""
     stages = (replace(stage, repeats=(RESET,)) if stage.densify else stage for stage in recipe.stages)
     return replace(recipe, stages=tuple(stages))
 
 
 def weighted(recipe: Recipe, **values: Any) -> Recipe:
-    """Other weights of the terms that are on."""
+    """Change the weights of the active terms."""
 
     def changed(stage: Stage) -> Stage:
         weights = {name: value for name, value in values.items() if getattr(stage.weights, name) > 0}
@@ -78,7 +78,7 @@ def weighted(recipe: Recipe, **values: Any) -> Recipe:
 
 
 def with_geometry(recipe: Recipe, *, flatness: float, consistency: float) -> Recipe:
-    """Terms that read no polarization, in the stages that are guided."""
+    """Enable terms without polarization in the guided stages."""
 
     def changed(stage: Stage) -> Stage:
         if stage.weights == Weights():
@@ -89,7 +89,7 @@ def with_geometry(recipe: Recipe, *, flatness: float, consistency: float) -> Rec
 
 
 def lengths(recipe: Recipe, **fractions: float) -> Recipe:
-    """Other shares of the stages; the one before the last gives or takes."""
+    """Change the shares of the stages at the expense of the last but one."""
     stages = [replace(stage, fraction=fractions.get(stage.name, stage.fraction)) for stage in recipe.stages]
     at = max(k for k, stage in enumerate(stages) if stage.name not in fractions)
     rest = 1 - sum(stage.fraction for k, stage in enumerate(stages) if k != at)
@@ -98,7 +98,7 @@ def lengths(recipe: Recipe, **fractions: float) -> Recipe:
 
 
 def settings_of(name: str, last: int = 0) -> Mapping[str, Recipe]:
-    """The settings of a recipe by what they change, or the last of them alone, and the recipe as it is."""
+    """Return the settings of a recipe by their change, or only the last of them, with the unchanged recipe."""
     base = recipe_named(name)
     assert isinstance(base, Recipe)
     return {AS_IT_IS: base, **dict([*SETTINGS[name](base).items()][-last:])}
@@ -236,7 +236,7 @@ def train(job: tuple[Path, Path, str, str, int, int]) -> None:
 
 
 def table(out: Path, scenes: list[Path], name: str, last: int) -> str:
-    """The settings of a recipe, and what each gives on each scene."""
+    """Return a table of the settings of a recipe and their scores on each scene."""
     scores = {
         setting: [read_metrics(folder_of(out, scene, name, setting)) for scene in scenes]
         for setting in settings_of(name, last)

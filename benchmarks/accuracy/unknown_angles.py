@@ -1,15 +1,15 @@
-"""How well unknown polarizer angles are found on a capture whose angles are known.
+"""Measure the search for unknown polarizer angles on a capture with known angles.
 
-One picture of each training view is kept, at 0, 45, 90 and 135 degrees in turn; ``--choices`` start the turn at another
-of the four. Then either all angles are withheld, or those of one fold of the views after the other (every
-``--folds``-th view), so that each view's is withheld once while the others are known. Angles are sought as ``polarguide
-train`` does; what follows the search does not change them and is left out.
+One picture of each training view remains, at 0, 45, 90 and 135 degrees in turn. ``--choices`` are starting points of
+the turn. Then all angles are withheld, or those of one fold of the views at a time (every ``--folds``-th view). With
+folds, each angle is withheld once while the others are known. The search is that of ``polarguide train``. Later steps
+of the training do not change the angles, so they are left out.
 
     python benchmarks/accuracy/unknown_angles.py CAPTURE --record FILE [--downscale 2] [--steps 1200]
     python benchmarks/accuracy/unknown_angles.py --record FILE
 
-Each search is recorded as it ends; the same command goes on with those that are missing. Without a capture, the tables
-of the record are printed. An odd number of folds has pictures at all four angles in each.
+Each search is recorded at its end, and the same command resumes with the missing ones. Without a capture, the tables of
+the record are printed. With an odd number of folds, each fold has pictures at all four angles.
 """
 
 from __future__ import annotations
@@ -38,11 +38,11 @@ from polarguide.training.recipe import Recipe
 from polarguide.training.settings import TrainSettings
 
 RIGHT, ACROSS = 15.0, 45.0
-"""Degrees of error up to which an angle is called right, and from which on it is nearer to the one across."""
+"""Largest error in degrees of a correct angle, and error in degrees beyond which the perpendicular angle is nearer."""
 
 
 def one_each(scene: Scene, first: int, withheld: Sequence[bool]) -> Scene:
-    """One picture of each training view, the first one's at ``FOUR[first]``; of some without its angle."""
+    """Keep one picture of each training view, the first at ``FOUR[first]``, and remove the angles of some."""
     changed = {}
     for k, view in enumerate(scene.train_views):
         place = (k + first) % len(FOUR)
@@ -53,7 +53,7 @@ def one_each(scene: Scene, first: int, withheld: Sequence[bool]) -> Scene:
 
 
 def searched(scene: Scene, steps: int) -> list[Judgment]:
-    """What a training of so many steps finds of the angles."""
+    """Search for the angles in a training of ``steps`` steps."""
     recipe = recipe_named("polarguide-stokes")
     assert isinstance(recipe, Recipe)
     settings = resolve(TrainSettings(steps=steps), scene, recipe)
@@ -64,7 +64,7 @@ def searched(scene: Scene, steps: int) -> list[Judgment]:
 
 
 def search(scene: Scene, steps: int, first: int, folds: int, fold: int) -> dict[str, Any]:
-    """Withhold the angles of a fold (of all views: one fold of one) and seek them; one row a picture."""
+    """Withhold the angles of a fold and search for them. A single fold has all views. Return a row per picture."""
     withheld = [k % folds == fold for k in range(len(scene.train_views))]
     began = time.perf_counter()
     found = searched(one_each(scene, first, withheld), steps)
@@ -79,7 +79,7 @@ def search(scene: Scene, steps: int, first: int, folds: int, fold: int) -> dict[
 
 
 def summary(searches: Sequence[dict[str, Any]]) -> list[str]:
-    """Cells of a table: pictures, median error, shares, doubtful, and the same of those that are not."""
+    """Return cells of a table: pictures, median error, shares, doubtful pictures, and the same of the others."""
     rows = [row for each in searches for row in each["pictures"]]
     errors = np.array([abs((found - true + 90) % 180 - 90) for _, true, found, *_ in rows])
     doubtful = np.array([row[-1] for row in rows], bool)

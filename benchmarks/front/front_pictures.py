@@ -1,4 +1,4 @@
-"""Pictures of the front page: a held-out view by three recipes beside the truth, and a film that wipes over layers.
+"""Draw pictures of the front page: a held-out view by three recipes next to the ground truth, and a film of all layers.
 
     polarguide synth benchmarks/front/tea.json --size 192x144 --samples 12 --out SCENE
     for recipe in 3dgs 3dgs-dr polarguide-stokes; do
@@ -6,9 +6,9 @@
     done
     python benchmarks/front/front_pictures.py SCENE RUNS --view v016
 
-Writes ``docs/images/front.jpg`` and ``docs/images/front.webp``; with ``--control RUN``, a training without
-polarization, only the pairs that the gallery wipes, into ``docs/_static/scenes``. Pictures have the size of the scene's
-own, whatever the training's was.
+Writes ``docs/images/front.jpg`` and ``docs/images/front.webp``. With ``--control RUN``, a training without
+polarization, it writes only the pairs of the gallery to ``docs/_static/scenes``. Pictures have the size of the scene's
+pictures, at any size of the training.
 """
 
 from __future__ import annotations
@@ -23,8 +23,7 @@ from PIL import Image, ImageDraw, ImageFont
 import polarguide as pg
 from polarguide.geometry.camera import Camera
 from polarguide.geometry.trajectory import orbit
-from polarguide.visualization.figures import Picture, contact_sheet
-from polarguide.visualization.figures import ground_truth_pictures, layer_picture
+from polarguide.visualization.figures import Picture, contact_sheet, ground_truth_pictures, layer_picture
 
 IMAGES = Path(__file__).resolve().parents[2] / "docs" / "images"
 PAGES = IMAGES.parent / "_static" / "scenes"
@@ -32,17 +31,17 @@ RECIPES = ("3dgs", "3dgs-dr", "polarguide-stokes")
 LAYERS = {"final": "picture", "specular": "specular", "diffuse": "diffuse", "normal": "normals"}
 FRAMES_PER_SECOND = 12
 HOLD, WIPE = 14, 16
-"""Frames in which a layer stands, and in which the next one comes over it."""
+"""Frames with one layer, and frames of a transition to the next one."""
 
 
 def drawn(run: pg.Run, camera: Camera) -> dict[str, Picture | None]:
-    """The layers of a run as 8-bit pictures; None where the recipe has none."""
+    """Return the layers of a run as 8-bit pictures; None for a missing layer."""
     result = run.result(camera)
     return {layer: layer_picture(result, layer, camera) for layer in LAYERS}
 
 
 def sheet(scene: pg.Scene, runs: dict[str, pg.Run], name: str) -> Picture:
-    """A held-out view: a row for each layer, the truth and each recipe side by side."""
+    """Return a held-out view with a row for each layer, the ground truth and all recipes side by side."""
     view = scene.view(name)
     columns = [ground_truth_pictures(view), *(drawn(run, view.camera) for run in runs.values())]
     none = absent(view.camera.width, view.camera.height)
@@ -55,7 +54,7 @@ def sheet(scene: pg.Scene, runs: dict[str, pg.Run], name: str) -> Picture:
 
 
 def write_pairs(scene: pg.Scene, ours: pg.Run, control: pg.Run, name: str, folder: Path) -> None:
-    """A held-out view: the photograph and ours, and each layer without and with polarization, as JPEG files."""
+    """Write a held-out view as JPEG files: the photograph and ours, and each layer without and with polarization."""
     view = scene.view(name)
     with_it, without = drawn(ours, view.camera), drawn(control, view.camera)
     pairs = {layer: (without[layer], with_it[layer]) for layer in LAYERS}
@@ -67,7 +66,7 @@ def write_pairs(scene: pg.Scene, ours: pg.Run, control: pg.Run, name: str, folde
 
 
 def absent(width: int, height: int) -> Picture:
-    """The tile of a layer that a recipe does not have."""
+    """Return the tile of a missing layer."""
     image = Image.new("RGB", (width, height), "#eeeeee")
     ImageDraw.Draw(image).text(
         (width / 2, height / 2), "none", font=ImageFont.load_default(18), fill="#777777", anchor="mm"
@@ -76,7 +75,7 @@ def absent(width: int, height: int) -> Picture:
 
 
 def film(run: pg.Run, size: tuple[int, int]) -> Iterator[Picture]:
-    """Once around the scene; each layer comes over the one before from the left, and the last over the first."""
+    """Yield the frames of a film around the scene. Each layer covers the previous one from the left."""
     layers = tuple(LAYERS)
     cycle = HOLD + WIPE
     first = next(iter(run.cameras.values()))
@@ -90,7 +89,7 @@ def film(run: pg.Run, size: tuple[int, int]) -> Iterator[Picture]:
 
 
 def named(picture: Picture | None, name: str) -> Picture:
-    """A picture with its name in the upper left corner."""
+    """Return a picture with its name in the upper left corner."""
     assert picture is not None
     image = Image.fromarray(picture)
     ImageDraw.Draw(image).text(
@@ -100,7 +99,7 @@ def named(picture: Picture | None, name: str) -> Picture:
 
 
 def wiped(pictures: dict[str, Picture | None], below: str, above: str, edge: int) -> Picture:
-    """One layer to the right of a column, another to the left of it, each with its name."""
+    """Join one layer to the right of a column and another one to the left of it, with their names."""
     frame = named(pictures[below], LAYERS[below])
     frame[:, :edge] = named(pictures[above], LAYERS[above])[:, :edge]
     if 0 < edge < frame.shape[1]:
@@ -109,7 +108,7 @@ def wiped(pictures: dict[str, Picture | None], below: str, above: str, edge: int
 
 
 def write_film(path: Path, frames: Sequence[Picture], quality: int) -> None:
-    """An animated WebP file that begins anew at its end."""
+    """Write an animated WebP file that repeats forever."""
     first, *others = (Image.fromarray(frame) for frame in frames)
     first.save(
         path, save_all=True, append_images=others, loop=0, duration=round(1000 / FRAMES_PER_SECOND),

@@ -1,8 +1,8 @@
-"""``make gpu-check``: build, tests, benchmarks and a full training on a GPU, in parts that can be gone on with.
+"""``make gpu-check``: build, tests, benchmarks and a full training on a GPU, in parts that can resume.
 
-Needs python3 with torch, nvcc with a C++ compiler, and the folder that ``pack.py`` made. Each call does what is still
-missing until its time is up (``--minutes``), says what is left, and writes a table and one JSON of what there is.
-Only the standard library is used here; each part is a process of its own.
+Needs python3 with torch, nvcc with a C++ compiler, and the folder of ``pack.py``. Each call does missing parts until
+its time is up (``--minutes``), lists the remaining ones, and writes a table and one JSON of all results. This script
+uses only the standard library, and each part has its own process.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ PARTS = (
     "bench-stress",
     "train-long",
 )
-# A part that has begun is not cut before this; none but the first build takes as long.
+# Minimum time of a part. Only the first build takes as long.
 LONGEST_SECONDS = 460.0
-# What the parts import beside torch; wheels of the pack stand in for what the machine lacks.
+# Packages of the parts besides torch. Wheels of the pack replace missing ones.
 MODULES = ("numpy", "scipy", "safetensors", "plyfile", "msgspec", "cv2", "rich", "pytest", "tyro", "ninja")
 
 
@@ -77,26 +77,26 @@ def main() -> None:
     print(f"\nwritten: {path}")
     if failed:
         sys.exit(f"{failed} failed (see above); the next call tries it again. Missing: {', '.join(missing)}")
-    print(f"still missing: {', '.join(missing)}; call again to go on" if missing else "complete")
+    print(f"still missing: {', '.join(missing)}; call again to resume" if missing else "complete")
 
 
 def read(out: Path, part: str) -> dict[str, Any]:
-    """What a part has written, {} before."""
+    """Return the result of a part; {} without one."""
     path = out / f"{part}.json"
     found: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {}
     return found
 
 
 def machine(results: dict[str, dict[str, Any]]) -> str:
-    """A file name for the device."""
+    """Return a file name for the device."""
     device = str(results["build"].get("device", "unknown"))
     return "".join(c if c.isalnum() else "-" for c in device.lower()).strip("-")
 
 
 def provide(pack: Path, out: Path) -> dict[str, str]:
-    """The environment of the parts: our source with its kernels, and the pack's wheels for what is not installed.
+    """Return the environment of the parts: our source with its kernels, and the pack's wheels of missing packages.
 
-    Where the source has no kernels, but polarguide is installed with them, that is taken as it is.
+    An installed polarguide with kernels replaces a source without kernels.
     """
     site = out / "site"
     if not pack.is_dir():
@@ -123,7 +123,7 @@ def provide(pack: Path, out: Path) -> dict[str, str]:
 
 
 def installed(wheel: Path) -> bool:
-    """Whether the machine has the package of a wheel, in any version."""
+    """Return True if the machine has the package of a wheel, in any version."""
     try:
         importlib.metadata.version(wheel.name.split("-")[0].replace("_", "-"))
     except importlib.metadata.PackageNotFoundError:
@@ -138,7 +138,7 @@ def pip(*arguments: str) -> None:
 
 
 def build_native(environment: dict[str, str], out: Path) -> None:
-    """Compile the CPU kernels for this Python, and put them beside our source."""
+    """Compile the CPU kernels for this Python, next to our source."""
     print("compiling polarguide's own kernels ...", flush=True)
     built = out / "native"
     command = [
@@ -160,14 +160,14 @@ def build_native(environment: dict[str, str], out: Path) -> None:
     shutil.unpack_archive(str(next(built.glob("polarguide-*.whl"))), unpacked, "zip")
     for stale in (ROOT / "src" / "polarguide").glob(
         "_native*.so"
-    ):  # of one version of Python: would be loaded first
+    ):  # kernels of one Python version take precedence
         stale.unlink()
     for library in (unpacked / "polarguide").glob("_native*.so"):
         shutil.copy2(library, ROOT / "src" / "polarguide")
 
 
 def run_part(part: str, arguments: argparse.Namespace, environment: dict[str, str], seconds: float) -> bool:
-    """One part in a process of its own; whether it succeeded."""
+    """Run one part in its own process, and return True for success."""
     if part == "tests":
         return run_tests(arguments, environment)
     command = [sys.executable, str(HERE / "parts.py"), part, "--pack", str(arguments.pack)]
@@ -184,9 +184,9 @@ def run_part(part: str, arguments: argparse.Namespace, environment: dict[str, st
 
 
 def run_tests(arguments: argparse.Namespace, environment: dict[str, str]) -> bool:
-    """The tests that need a GPU. Without one they are skipped, and say so."""
+    """Run the tests that need a GPU. Without a GPU they are skipped with a message."""
     command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "-W", "default"]
-    # By file, since the other tests import what a bare machine does not have.
+    # Listed by file, because the other tests import packages that a bare machine does not have.
     command += sorted(map(str, (ROOT / "tests").glob("*/test_*_on_gpu.py")))
     done = subprocess.run(
         command,
@@ -217,7 +217,7 @@ RATIOS = (("our step over plain", "step_ratio"), ("our frames over plain", "fps_
 
 
 def table(results: dict[str, dict[str, Any]]) -> str:
-    """One table of all benchmarks, as Markdown."""
+    """Return one table of all benchmarks as Markdown."""
     benches = [
         (part, results[part]) for part in PARTS if part.startswith("bench") and results[part].get("ours")
     ]
@@ -247,7 +247,7 @@ def table(results: dict[str, dict[str, Any]]) -> str:
 
 
 def number(value: float | None) -> str:
-    """Three digits or so."""
+    """Format a number with about three digits."""
     return "n/a" if value is None else f"{value:.0f}" if abs(value) >= 100 else f"{value:.3g}"
 
 

@@ -1,4 +1,4 @@
-"""The same Gaussians, pictures, SSIM and Adam in a ``polarguide`` step and in a plain gsplat step."""
+"""Compare a ``polarguide`` step with a plain gsplat step: the same Gaussians, pictures, SSIM and Adam."""
 
 from __future__ import annotations
 
@@ -28,21 +28,21 @@ STEPS, BEGIN = 1_000_000, 300_000  # in stage 2 of polarguide, with all harmonic
 
 
 def steady(name: str) -> Recipe:
-    """A recipe in which nothing happens between steps: no density control, resets or refreshes."""
+    """Return a recipe without actions between steps: no density control, resets or refreshes."""
     recipe = RECIPES[name]
     stages = tuple(replace(stage, repeats=()) for stage in recipe.stages)
     return replace(recipe, stages=stages, densification=replace(recipe.densification, every=STEPS))
 
 
 def split_to(state: TrainingState, count: int, seed: int = 0) -> dict[str, Tensor]:
-    """Parameters of ``count`` Gaussians: many smaller copies of those of a trained state, drawn from each."""
+    """Return parameters of ``count`` Gaussians: smaller copies of those of a trained state, drawn from each."""
     parameters, generator = state.gaussians.snapshot(), torch.Generator().manual_seed(seed)
     present = len(parameters["means"])
     pick = torch.arange(count) % present
     copies = count / present
     chosen = {name: t[pick.to(t.device)] for name, t in parameters.items()}
     drawn = torch.randn(count, 3, generator=generator).to(chosen["means"])
-    # On flat Gaussians, so that a surface stays one: less far along the shortest axis would be no different.
+    # Copies stay on flat surfaces: along the shortest axis they are less far away.
     chosen["means"] = chosen["means"] + 0.5 * drawn * chosen["log_scales"].exp()
     chosen["log_scales"] = chosen["log_scales"] - torch.log(torch.tensor(copies**0.5))
     return chosen
@@ -63,7 +63,7 @@ class Ours:
         self._turn = 0
 
     def forward(self) -> None:
-        """What a step renders."""
+        """Render a step."""
         trainer, state = self.trainer, self.trainer.state
         render(
             state.gaussians,
@@ -75,16 +75,16 @@ class Ours:
         )
 
     def look(self) -> None:
-        """Forward and backward, with all losses."""
+        """Run forward and backward with all losses."""
         self.trainer.backpropagate(self._next())
 
     def step(self) -> None:
-        """A whole step."""
+        """Run a complete step."""
         self.trainer.step()
 
     @torch.no_grad()
     def frame(self, *, layers: bool) -> None:
-        """A picture of a trained scene: the final one, or all layers."""
+        """Render a picture of a trained scene: the final layer, or all layers."""
         trainer, state = self.trainer, self.trainer.state
         view = trainer.feed.view_at(state.step + self._next())
         render(
@@ -97,7 +97,7 @@ class Ours:
         )
 
     def parts(self) -> dict[str, Any]:
-        """The rasterizer, SSIM and the optimizer of a step by themselves, as calls."""
+        """Return the rasterizer, SSIM and the optimizer of a step as separate calls."""
         trainer, gaussians = self.trainer, self.trainer.state.gaussians
         view = trainer.feed.view_at(trainer.state.step)
         inputs = Splats(
@@ -135,7 +135,7 @@ class Ours:
 
 
 class Plain:
-    """Plain 3D Gaussian splatting by gsplat's own ``rasterization``, harmonics included."""
+    """Plain 3D Gaussian splatting by gsplat's own ``rasterization``, including harmonics."""
 
     def __init__(self, scene: Scene, parameters: dict[str, Tensor], device: torch.device) -> None:
         self._gsplat = importlib.import_module("gsplat")
@@ -151,7 +151,7 @@ class Plain:
         self._turn = 0
 
     def forward(self) -> tuple[Tensor, dict[str, Any], Tensor]:
-        """A picture, what gsplat reports about it, and the photograph."""
+        """Return a picture, gsplat's statistics of it, and the photograph."""
         self._turn = (self._turn + 1) % len(self._views)
         viewmat, intrinsics, width, height, shown = self._views[self._turn]
         gaussians = self.gaussians
@@ -171,18 +171,18 @@ class Plain:
         return picture[0], details, shown
 
     def look(self) -> None:
-        """Forward and backward, and the statistic of the density control."""
+        """Run forward and backward, and update the statistic of the density control."""
         picture, details, shown = self.forward()
         details["means2d"].retain_grad()
         photometric_loss(picture, shown).backward()
         self._pull += details["means2d"].grad[0].norm(dim=-1)
 
     def step(self) -> None:
-        """A whole step."""
+        """Run a complete step."""
         self.look()
         self.gaussians.step()
 
     @torch.no_grad()
     def frame(self) -> None:
-        """A picture."""
+        """Render a picture."""
         self.forward()

@@ -1,4 +1,4 @@
-"""Milliseconds by CUDA events, or by the clock where there is no GPU; and memory."""
+"""Measure milliseconds by CUDA events, or by the clock without a GPU; and memory."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import torch
 
 
 def milliseconds(call: Callable[[], object], device: torch.device, *, repeats: int, warm_up: int) -> float:
-    """Median time of a call, after ``warm_up`` others; the queue is empty before each."""
+    """Return the median time of a call, after ``warm_up`` others. The queue is empty before each call."""
     for _ in range(warm_up):
         call()
     times = []
@@ -31,7 +31,7 @@ def milliseconds(call: Callable[[], object], device: torch.device, *, repeats: i
 
 
 def peak_mib(call: Callable[[], object], device: torch.device) -> float | None:
-    """Most memory that tensors held during a call, MiB; None without a GPU."""
+    """Return the peak memory of tensors during a call in MiB; None without a GPU."""
     if device.type != "cuda":
         call()
         return None

@@ -1,7 +1,7 @@
-"""What ``make gpu-check`` needs on a machine without a network, into one folder: scenes, and wheels.
+"""Collect the scenes and wheels that ``make gpu-check`` needs on a machine without a network, in one folder.
 
-``python benchmarks/gpu/pack.py --scene SCENES/spheres --python 3.12`` here; then carry the repository with the folder
-``gpu-pack`` to the machine with the GPU, and run ``make gpu-check`` there.
+Run ``python benchmarks/gpu/pack.py --scene SCENES/spheres --python 3.12`` here. Then copy the repository with the
+folder ``gpu-pack`` to the machine with the GPU, and run ``make gpu-check`` there.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from packed import SUFFIX, save_scene
 
 from polarguide.capture import load_scene
 
-# What a machine with torch, numpy and nvcc may lack; without their dependencies, so they are all listed.
+# Packages that a machine with torch, numpy and nvcc may lack, including their dependencies.
 WHEELS = (
     "gsplat==1.5.3",
     "jaxtyping",
@@ -75,7 +75,7 @@ def main() -> None:
 
 
 def download(folder: Path, python: str, wheels: tuple[str, ...]) -> None:
-    """The wheels for another machine's Python, by pip."""
+    """Download the wheels for another machine's Python with pip."""
     command = [sys.executable, "-m", "pip", "download", "--quiet", "--disable-pip-version-check", "--no-deps"]
     command += ["--only-binary=:all:", "--implementation", "cp", "--python-version", python]
     for platform in PLATFORMS:

@@ -1,4 +1,4 @@
-"""Scenes in one small file each, for a machine that has torch and numpy and cannot read captures."""
+"""Store scenes in one small file each, for a machine with torch and numpy that cannot read captures."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SUFFIX = ".scene.npz"
 
 
 def save_scene(scene: Scene, path: Path) -> None:
-    """Write a scene without its ground truth. Pictures are kept exactly, as differences along rows."""
+    """Write a scene without its ground truth. Pictures are stored losslessly, as differences along rows."""
     arrays: dict[str, Any] = {
         "points": scene.points.numpy(),
         "point_colors": scene.point_colors.numpy(),
@@ -24,7 +24,8 @@ def save_scene(scene: Scene, path: Path) -> None:
     }
     for number, view in enumerate(scene.views):
         camera, codes = view.camera, view.codes.numpy()
-        steps = np.diff(codes, axis=2, prepend=np.zeros_like(codes[:, :, :1]))  # wraps around: exact
+        # Integer overflow wraps around, so the differences are exact.
+        steps = np.diff(codes, axis=2, prepend=np.zeros_like(codes[:, :, :1]))
         arrays |= {
             f"{number}.name": np.array(view.name),
             f"{number}.high": (steps >> 8).astype(np.uint8),
@@ -37,7 +38,7 @@ def save_scene(scene: Scene, path: Path) -> None:
 
 
 def read_scene(path: Path) -> Scene:
-    """The inverse of ``save_scene``."""
+    """Invert ``save_scene``."""
     with np.load(path) as file:
         about = json.loads(str(file["about"]))
         count = sum(name.endswith(".name") for name in file.files)
@@ -70,7 +71,7 @@ def _view(file: Any, number: int) -> View:
 
 
 def enlarged(scene: Scene, width: int, height: int, views: int) -> Scene:
-    """The first training views at another size, by linear interpolation: for timing, not for looking at."""
+    """Return the first training views at another size, by linear interpolation. It serves only for timing."""
     chosen = scene.train_views[:views]
     return Scene(
         **{**scene.__dict__, "views": tuple(_enlarged(v, width, height) for v in chosen), "test_names": ()}

@@ -1,6 +1,6 @@
-"""The parts of ``make gpu-check``, each a process of its own: ``parts.py NAME --pack DIR --out DIR``.
+"""Run a part of ``make gpu-check`` in its own process: ``parts.py NAME --pack DIR --out DIR``.
 
-A part writes OUT/NAME.json. The long training works until its time is up and goes on in the next call.
+A part writes OUT/NAME.json. The long training stops when its time is up and resumes in the next call.
 """
 
 from __future__ import annotations
@@ -38,10 +38,14 @@ RECIPE = RECIPES["polarguide"]
 
 @dataclass(frozen=True)
 class Job:
-    """What a part is given.
+    """Arguments of a part.
 
     Attributes:
-        pack, out: folders. backend: to measure. tiny: for a dry run on a CPU. seconds: that it may take.
+        pack: folder of the scenes.
+        out: output folder.
+        backend: measured backend.
+        tiny: True for a dry run on a CPU.
+        seconds: time limit.
     """
 
     pack: Path
@@ -51,7 +55,7 @@ class Job:
     seconds: float
 
     def scene(self, name: str) -> Scene:
-        """A packed scene; a dry run takes the demo for all, and few of its views."""
+        """Return a packed scene. A dry run uses few views of the demo instead."""
         scene = read_scene(self.pack / f"{'demo' if self.tiny else name}{SUFFIX}")
         if not self.tiny:
             return scene
@@ -60,7 +64,7 @@ class Job:
 
 
 def train_on(job: Job, name: str, steps: int, folder: Path) -> dict[str, Any]:
-    """Train ``polarguide`` as far as the time allows, from where it stood."""
+    """Train ``polarguide`` until the time is up, resuming the previous call."""
     folder.mkdir(parents=True, exist_ok=True)
     begin, clock = time.perf_counter(), folder / "seconds.json"
     spent = json.loads(clock.read_text()) if clock.exists() else 0.0
@@ -92,7 +96,7 @@ def train_on(job: Job, name: str, steps: int, folder: Path) -> dict[str, Any]:
 
 @torch.no_grad()
 def mean_psnr(scene: Scene, state: TrainingState, backend: Backend) -> float:
-    """Mean over the test views, in decibels."""
+    """Return the mean over the test views, in decibels."""
     shading, values = RECIPE.shading.bind(1.5), []
     for view in scene.test_views:
         picture = render(
@@ -103,13 +107,13 @@ def mean_psnr(scene: Scene, state: TrainingState, backend: Backend) -> float:
 
 
 def wait(device: torch.device) -> None:
-    """Until the GPU has done what it was asked for."""
+    """Wait until the GPU has finished."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)
 
 
 def bench(job: Job, scene: Scene, state: TrainingState) -> dict[str, Any]:
-    """Ours against plain gsplat on the same Gaussians."""
+    """Compare our steps with plain gsplat on the same Gaussians."""
     device, few = job.backend.device, job.tiny
     repeats, warm_up = (2, 1) if few else (40, max(10, len(scene.train_views) + 2))
     initial = state.gaussians.snapshot()
@@ -151,7 +155,7 @@ def bench(job: Job, scene: Scene, state: TrainingState) -> dict[str, Any]:
 
 
 def build(job: Job) -> dict[str, Any]:
-    """Which machine this is; gsplat has been compiled by the time it is asked."""
+    """Describe the machine. This also compiles gsplat."""
     found: dict[str, Any] = {
         "polarguide": polarguide.__version__,
         "torch": torch.__version__,
@@ -166,12 +170,12 @@ def build(job: Job) -> dict[str, Any]:
 
 
 def trained(job: Job, name: str) -> TrainingState:
-    """The state of the short training of a scene."""
+    """Return the state of the short training of a scene."""
     return load_checkpoint(job.out / f"train-{name}", RECIPE, job.backend.device)
 
 
 def stress(job: Job) -> dict[str, Any]:
-    """A million Gaussians at 1224 x 1024."""
+    """Measure a million Gaussians at 1224 x 1024."""
     count, size = (10_000, (96, 80)) if job.tiny else (1_000_000, (1224, 1024))
     state = trained(job, "spheres")
     gaussians = Gaussians(split_to(state, count), RECIPE.rates)
@@ -180,7 +184,7 @@ def stress(job: Job) -> dict[str, Any]:
 
 
 def parts_of(tiny: bool) -> dict[str, Callable[[Job], dict[str, Any]]]:
-    """What there is to do, in order."""
+    """Return the parts in their order."""
     short, paper = (10, 20) if tiny else (3000, 97_000)
 
     def train_short(name: str) -> Callable[[Job], dict[str, Any]]:

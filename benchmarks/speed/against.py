@@ -1,11 +1,11 @@
-"""A training step of this checkout against one of another, on the same trained Gaussians, in turns.
+"""Compare a training step of this checkout with another checkout, on the same trained Gaussians, in turns.
 
     python benchmarks/speed/against.py RUN --before CHECKOUT... [--threads 1] [--turns 5] [--steps 40]
 
-Each checkout works in a process of its own with its own code (``CHECKOUT/src``, with its native module built there) and
-its own recipe of that name, and they take turns, so that none runs while another is timed. Steps are those of the
-longest stage, each made twice and the second timed: priors, which are computed when the guide is refreshed, are not in
-them. Printed are the median milliseconds and the median over the turns of the ratio. Run it alone.
+Each checkout has its own process with its own code (``CHECKOUT/src``, with its native module built there) and its own
+recipe of that name. They take turns, so that only one runs at a time. Steps are those of the longest stage. Each step
+runs twice, and the second is timed, so the computation of priors is not included. Prints the median milliseconds, and
+the median over the turns of the ratio. Run it without other work on the machine.
 """
 
 from __future__ import annotations
@@ -20,30 +20,35 @@ from pathlib import Path
 
 HERE = Path(__file__).resolve().parents[2]
 
-# Kept to what both sides have; the other checkout may be much older.
+# Only features of both checkouts: the other one may be much older.
 WORKER = """
 import sys, time
 sys.path[:] = [path for path in sys.path if path]
 import numpy as np, torch
 from polarguide.capture import load_scene
+
 try:
     from polarguide.core.system import keep_freed_memory
 except ImportError:
     keep_freed_memory = lambda: None
 from polarguide.raster import choose_backend
+
 try:
     from polarguide.raster import use_threads
 except ImportError:
     use_threads = torch.set_num_threads
 from polarguide.recipes import RECIPES
+
 try:
     from polarguide.runs.folder import resolve
 except ImportError:
     resolve = lambda settings, *of: settings
+
 try:
     from polarguide.training.settings import TrainSettings
 except ImportError:
     from polarguide.training.trainer import TrainSettings
+
 try:
     from polarguide.training.angles.fits import gaussian_training
     from polarguide.training.context import TrainingContext
@@ -58,16 +63,19 @@ use_threads(int(threads))
 scene = load_scene(scene, downscale=int(downscale))
 settings = resolve(TrainSettings(5000, 0), scene, RECIPES[recipe])
 trainer = Trainer(scene, RECIPES[recipe], settings, choose_backend("cpu"))
-kept, trained = np.load(gaussians), getattr(trainer.state, "gaussians", None) or trainer.state.rows
-count = len(kept["means"])
+
+stored, trained = np.load(gaussians), getattr(trainer.state, "gaussians", None) or trainer.state.rows
+count = len(stored["means"])
 trained.keep(torch.arange(count) % len(trained))
 for name in trained.names:
-    if name in kept:
-        trained.overwrite(name, torch.from_numpy(kept[name]))
+    if name in stored:
+        trained.overwrite(name, torch.from_numpy(stored[name]))
+
 if hasattr(trainer.state, "statistics"):
     trainer.state.statistics.clear(count)
 else:
     trainer.begin(trainer.current, trainer.state)
+
 longest = max(RECIPES[recipe].stages, key=lambda stage: stage.fraction)
 every = RECIPES[recipe].densification.every
 calm = [

@@ -1,6 +1,6 @@
-"""Speed of the picture and color kernels against their reference implementations in plain torch.
+"""Measure the picture and color kernels against their reference implementations in plain torch.
 
-Each figure is milliseconds, forward and backward together: the median and, in brackets, the minimum over the
+Each number is milliseconds, forward and backward together: the median and, in brackets, the minimum over the
 repeats. The two sides take turns, so a busy machine slows both. ``python benchmarks/speed/image_kernels.py``.
 """
 
@@ -23,7 +23,7 @@ from polarguide.training.photometric import photometric_loss, photometric_loss_r
 def forward_backward(
     function: Callable[..., Tensor], leaves: list[Tensor], *rest: object
 ) -> Callable[[], None]:
-    """One forward and one backward pass of ``function(*leaves, *rest)`` with a fixed upstream gradient."""
+    """Run one forward and one backward pass of ``function(*leaves, *rest)`` with a fixed upstream gradient."""
     upstream = torch.rand_like(function(*leaves, *rest).detach())
 
     def run() -> None:
@@ -43,7 +43,7 @@ def photometric_pair(width: int, height: int) -> tuple[Callable[[], None], Calla
 
 
 def cubemap_pair(resolution: int, count: int) -> tuple[Callable[[], None], Callable[[], None]]:
-    """Directions like those of a picture: neighbors reflect into neighboring texels."""
+    """Return directions like those of a picture: neighbors reflect into neighboring texels."""
     texture = torch.randn(6, resolution, resolution, 3).requires_grad_()
     side = int(count**0.5) + 1
     grid = torch.stack(
@@ -68,7 +68,7 @@ def harmonics_pair(count: int, degree: int) -> tuple[Callable[[], None], Callabl
 
 
 def milliseconds(sides: tuple[Callable[[], None], ...], repeats: int, seconds: float) -> list[list[float]]:
-    """Times of each side after a first round that does not count; fewer than ``repeats`` where they are slow."""
+    """Return times of each side after a warm-up round, with fewer than ``repeats`` repeats of slow calls."""
     times: list[list[float]] = [[] for _ in sides]
     for run in sides:
         run()

@@ -1,10 +1,9 @@
-"""Peak resident memory of a training, beside what was said of it before.
+"""Compare the peak resident memory of a training with its plan.
 
     python benchmarks/speed/memory.py SCENE [--downscale 4 2 1] [--memory 0 4GB] [--steps 24]
 
-Each row is a process of its own, ``polarguide train`` as a user calls it: the peak is that which the system accounts to
-it at its end. With few steps the Gaussians are still few, and not all views have been visited: give as many steps as a
-training of the scene has views, and half as many again.
+Each row is a process of ``polarguide train`` with the peak that the system reports at its end. With few steps there are
+few Gaussians and unvisited views. Give 1.5 times as many steps as a training of the scene has views.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=24)
     parser.add_argument("--recipe", default="polarguide-stokes")
     options = parser.parse_args()
-    print("| downscale | --memory | peak GB | CPU s | of it system |")
+    print("| downscale | --memory | peak GB | CPU s | system s |")
     print("|---|---|---|---|---|")
     for downscale in options.downscale:
         for memory in options.memory:

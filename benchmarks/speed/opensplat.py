@@ -1,11 +1,11 @@
-"""Our training step on the CPU against that of OpenSplat, another program for Gaussian splatting, on the same pictures.
+"""Compare our training step on the CPU with OpenSplat, another program for Gaussian splatting, on the same pictures.
 
     python benchmarks/speed/opensplat.py SCENE --opensplat PATH [--downscale 2] [--steps 90] [--threads 1] [--turns 3]
 
-PATH is the program ``opensplat``, which is no part of this project and has to be built by whoever compares. Both get
-the training views' photographs, poses and points, train for so many steps at full size, before the density control of
-either begins, and take turns. What a program needs before its first step, reading and starting, is measured with one
-step and subtracted. Run it alone.
+PATH is the program ``opensplat``, which is not part of this project; build it yourself. Both get the training views'
+photographs, poses and points. They train at full size and end before their first density control. They take turns. The
+time before the first step, for reading and starting, is measured with one step and subtracted. Run it without other
+work on the machine.
 """
 
 from __future__ import annotations
@@ -22,31 +22,31 @@ import pycolmap
 import torch
 
 from polarguide.capture import Scene, load_scene
-from polarguide.capture.write import write_png
+from polarguide.capture.write import write_png_file
 from polarguide.optics.color import srgb_encode
 from polarguide.results.export.placement import write_colmap
 
 MOST_STEPS = 98
-"""Ours first looks at the density after 100 steps, OpenSplat after 500."""
+"""Largest number of steps. Our density control begins after 100 steps, OpenSplat's after 500."""
 
 
 def write_project(scene: Scene, folder: Path) -> None:
-    """The training views as a COLMAP project of ordinary photographs."""
+    """Write the training views as a COLMAP project of ordinary photographs."""
     (folder / "images").mkdir(parents=True)
     for view in scene.train_views:
         shown = srgb_encode(view.photograph().clamp(0, 1)) * 255
-        write_png(folder / "images" / f"{view.name}.png", shown.round().to(torch.uint8).numpy())
+        write_png_file(folder / "images" / f"{view.name}.png", shown.round().to(torch.uint8).numpy())
     cameras = {view.name: view.camera for view in scene.train_views}
     model = folder / "sparse" / "0"
     write_colmap(model, cameras, scene.points, scene.point_colors)
-    pycolmap.Reconstruction(str(model)).write_binary(str(model))  # it reads no text
+    pycolmap.Reconstruction(str(model)).write_binary(str(model))  # OpenSplat reads no text models
 
 
 def seconds(command: list[str], threads: int, folder: Path) -> tuple[float, float]:
-    """Processor and wall seconds of a command.
+    """Return processor and wall seconds of a command.
 
     Raises:
-        SystemExit: it failed; with the last lines that it printed.
+        SystemExit: the command failed. The message contains its last lines.
     """
     environment = {
         **os.environ,
@@ -110,7 +110,7 @@ def main() -> None:
         f"{camera.width} x {camera.height}, {len(scene.points):,} points, {options.steps} steps, "
         f"{options.threads} threads, medians of {options.turns} turns\n"
     )
-    print("| program | processor ms a step | wall ms a step |\n|---|---|---|")
+    print("| program | processor ms per step | wall ms per step |\n|---|---|---|")
     for name, values in taken.items():
         used, wall = (1e3 * statistics.median(column) for column in zip(*values, strict=True))
         print(f"| {name} | {used:.1f} | {wall:.1f} |")

@@ -1,11 +1,11 @@
-"""Time to quality: another checkout's training of so many steps against fewer steps of this one, pair by pair.
+"""Compare time to quality: a training of another checkout with a shorter training of this one, pair by pair.
 
     python benchmarks/speed/quality.py --before CHECKOUT --scenes SCENE... [--seeds 0 1 2] [--steps 5000] [--now 4000]
         [--recipe polarguide-stokes] [--threads 1] [--out FOLDER]
 
-Both train and score in processes of their own, one after the other, each with its own code (``CHECKOUT/src``, with its
-native module built there). Seconds are those of the training, priors included, as its log has them. A run that is
-scored is not made again, so that the whole can be stopped and gone on with. Run it alone.
+Both train and score in their own processes, one after the other, each with its own code (``CHECKOUT/src``, with its
+native module built there). Seconds are those of the training in its log, including priors. Scored runs are not
+repeated, so the command can resume. Run it without other work on the machine.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def command(checkout: Path, *words: object) -> None:
 def trained(
     checkout: Path, scene: Path, out: Path, steps: int, seed: int, options: argparse.Namespace
 ) -> dict[str, float]:
-    """Scores and seconds of a run, which is made where it is not there yet."""
+    """Return scores and seconds of a run, which is trained if it is missing."""
     if not (out / "metrics.json").exists():
         shared = "--recipe", options.recipe, "--steps", steps, "--seed", seed, "--threads", options.threads
         resumed = ("--resume",) if (out / "run.json").exists() else ()
@@ -75,7 +75,7 @@ def main() -> None:
             )
             now = trained(HERE, scene, out / f"now-{name}", options.now, seed, options)
             rows.append((name, before, now))
-    print("| scene, seed | seconds | of before | " + " | ".join(SCORES.values()) + " |")
+    print("| scene, seed | seconds | share of time | " + " | ".join(SCORES.values()) + " |")
     print("|" + "---|" * (3 + len(SCORES)))
     for name, before, now in rows:
         share = now["seconds"] / before["seconds"]

@@ -1,14 +1,15 @@
-"""The CPU rasterizer's speed: milliseconds, pixel-Gaussian pairs a second, and the shares of the processor's and of the
-memory's peak.
+"""Measure the CPU rasterizer: milliseconds, pixel-Gaussian pairs per second, and shares of the hardware's peaks.
 
-Two cases: few Gaussians of three pixels, bound by their pairs with pixels, and many of half a pixel, bound by gathering
-them. Both peaks are measured in the same run: independent fused multiply-adds with the widest instruction set and all
-threads, and a copy between two arrays that no cache holds. A pair counts 150 flop for both passes, 50 of them forward.
-Of memory, what has to be read and written at least: each Gaussian and its gradient, each pixel and its gradient, once.
+The first case has few Gaussians of three pixels and is bound by their pairs with pixels. The second case has many
+Gaussians of half a pixel and is bound by gathering them. The same run measures both peaks: independent fused
+multiply-adds with the widest instruction set and all threads, and a copy between two arrays that no cache holds.
+
+A pair counts 150 flop for both passes, 50 of them forward. Memory traffic is the minimum of reads and writes: each
+Gaussian and its gradient, each pixel and its gradient, once.
 
     python benchmarks/speed/rasterizer.py [--threads 1]
 
-Run it alone.
+Run it without other work on the machine.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ FLOP_PER_PAIR = 150
 
 
 def scene(count: int, width: int, height: int, channels: int, sigma: float) -> tuple[Splats, Camera]:
-    """Gaussians of about ``sigma`` pixels, spread over the picture, of mixed shape and opacity."""
+    """Return Gaussians of about ``sigma`` pixels, spread over the picture, of mixed shape and opacity."""
     generator = torch.Generator().manual_seed(0)
     camera = Camera(
         width, height, width, width, width / 2, height / 2, torch.eye(3).double(), torch.zeros(3).double()
@@ -46,13 +47,13 @@ def scene(count: int, width: int, height: int, channels: int, sigma: float) -> t
 
 CASES = {"pairs": (20_000, 3.0), "gathering": (300_000, 0.5)}
 COPIED = 256 << 20
-"""Bytes."""
+"""Size of a float in bytes."""
 OF_GAUSSIAN, OF_PIXEL = 11, 1
-"""Floats of a Gaussian (mean, rotation, scales, opacity) and of a pixel (alpha) beside its features."""
+"""Floats of a Gaussian (mean, rotation, scales, opacity) and of a pixel (alpha), without features."""
 
 
 def bandwidth() -> float:
-    """Bytes a second that a copy reads and writes."""
+    """Return the bytes per second that a copy reads and writes."""
     source, to = torch.ones(COPIED // 4), torch.empty(COPIED // 4)
     times = []
     for _ in range(7):
@@ -63,7 +64,7 @@ def bandwidth() -> float:
 
 
 def measured(count: int, sigma: float, channels: int, size: tuple[int, int], repeats: int) -> list[float]:
-    """Pairs, and median seconds of the forward and of the backward pass."""
+    """Return pairs, and median seconds of the forward and of the backward pass."""
     width, height = size
     splats, camera = scene(count, width, height, channels, sigma)
     rasterizer = native_rasterizer(camera, channels, ScreenStatistic((0, 1, 2)))
@@ -98,13 +99,13 @@ def main() -> None:
     print(
         f"{_native.simd()}, {_native.thread_count()} threads, {peak / 1e9:.0f} GFLOP/s, {memory / 1e9:.1f} GB/s\n"
     )
-    print("| bound by | D | pairs | forward ms | backward ms | Mpairs/s | of flop | of memory |")
+    print("| bound by | D | pairs | forward ms | backward ms | Mpairs/s | share of flop | share of memory |")
     print("|---|---|---|---|---|---|---|---|")
     for name, (count, sigma) in CASES.items():
         for channels in arguments.channels:
             size = tuple(arguments.size)
             pairs, f, b = measured(count, sigma, channels, size, arguments.repeats)
-            # Read forward and backward, and written as gradients; pictures written, read again, and their gradients.
+            # Gaussians: read twice, gradients written. Pictures: written, read again, and their gradients.
             floats = 3 * count * (OF_GAUSSIAN + channels) + 3 * size[0] * size[1] * (OF_PIXEL + channels)
             print(
                 f"| {name} | {channels} | {pairs / 1e6:.2f} M | {f * 1e3:.2f} | {b * 1e3:.2f} "

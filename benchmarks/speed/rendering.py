@@ -1,8 +1,9 @@
-"""What rendering all layers costs against plain Gaussian splatting of the same Gaussians.
+"""Measure the cost of all layers against plain Gaussian splatting of the same Gaussians.
 
-Every test view is drawn in turn as color alone and as all layers, without depth, with it, and with normals and depth of
-the surface; the ratio is taken within each turn, so that a slow moment of the machine meets all. Run it alone:
-``python benchmarks/speed/rendering.py RUN... [--size 1920x1080] [--threads 1 2]``.
+Each test view is drawn in turn as color alone and as all layers. All layers are drawn without depth, with depth, and
+with normals and depth of the surface. The ratio is computed within each turn, so that a slow moment of the machine
+affects all. Run it without other work on the machine: ``python benchmarks/speed/rendering.py RUN... [--size 1920x1080]
+[--threads 1 2]``.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ def milliseconds(draw: Callable[[], object]) -> float:
 
 
 def shown_at(camera: Camera, size: tuple[int, int] | None) -> Camera:
-    """The camera with a picture of this size, which it fills."""
+    """Return the camera with a picture of this size and the same field of view."""
     if size is None:
         return camera
     factor = max(size[0] / camera.width, size[1] / camera.height)
@@ -67,7 +68,7 @@ def measure(opened: Run, rounds: int, size: tuple[int, int] | None, threads: int
         for camera in cameras:
             for way in ways:
                 taken = milliseconds(lambda way=way, camera=camera: way(camera))  # type: ignore[misc]
-                if turn:  # the first warms up
+                if turn:  # the first is a warm-up
                     times[way.__name__].append(taken)
     median = {name: statistics.median(taken) for name, taken in times.items()}
     ratios = [

@@ -1,10 +1,10 @@
-"""Where the time of a training step goes, for each recipe and number of threads; ``make speed`` calls it.
+"""Measure the parts of a training step, for each recipe and number of threads. ``make speed`` calls it.
 
     python benchmarks/speed/steps.py [SCENE_OR_RUN] [--recipes 3dgs polarguide-stokes] [--threads 1 2 4] [--downscale 1]
 
-A run gives its trained Gaussians, with which all its steps are those of the longest stage at full size; a scene those
-of the first step, scattered by the points of its model. Each view is looked at once before it is timed, so that priors,
-which are computed once between two refreshes, are a line of their own. Parts are timed around the native calls.
+With a run, steps are those of the longest stage at full size, with its trained Gaussians. With a scene, they are those
+of the first step, with Gaussians at the points of its model. Each view is visited once before it is timed, so that
+priors, which are computed once between two refreshes, have their own line. The native calls are timed.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ PARTS = {
 
 
 class Clock:
-    """Adds up milliseconds by part."""
+    """Sums of milliseconds by part."""
 
     def __init__(self) -> None:
         self.parts: dict[str, float] = {}
@@ -67,7 +67,7 @@ class Clock:
         return run
 
     def watch(self) -> None:
-        """Time every part from now on."""
+        """Start timing all parts."""
         for part, names in PARTS.items():
             for name in names:
                 holder, _, attribute = name.rpartition(".")
@@ -77,17 +77,17 @@ class Clock:
         Feed.targets = self.timed("targets", Feed.targets)  # type: ignore[method-assign]
 
     def take(self) -> dict[str, float]:
-        """What has been added up; then it starts again."""
+        """Return the sums and reset them."""
         found, self.parts = self.parts, {}
         return found
 
 
 def measured(trainer: TrainingLoop, clock: Clock, steps: int) -> tuple[dict[str, float], float]:
-    """Medians of the parts of a step in the longest stage, and of the priors of a view; milliseconds."""
+    """Return medians of the parts of a step in the longest stage, and of the priors of a view, in milliseconds."""
     schedule, last = trainer.schedule, trainer.settings.steps
     every, coarse = trainer.context.recipe.densification.every, trainer.context.recipe.coarse
     largest = max(view.camera.width * view.camera.height for view in trainer.context.scene.train_views)
-    # Pictures as they are: large ones are smaller in the first steps.
+    # Full-size pictures: the first steps reduce large ones.
     first = math.ceil(coarse.share * last) if largest >= coarse.pixels else 1
     names = [schedule.at(step).stage.name for step in range(first, last - 1)]
     longest = statistics.mode(names)

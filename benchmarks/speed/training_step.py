@@ -1,7 +1,7 @@
-"""Milliseconds of one training step of plain Gaussian splatting, and where they go.
+"""Measure the milliseconds of a training step of plain Gaussian splatting and its parts.
 
-A fixed number of Gaussians (no densification), steps 100 to 400 on a scene's training views. The rasterizer is
-timed around its two native calls; the rest is harmonics, loss, optimizer and autograd. Run it alone:
+A fixed number of Gaussians (no densification), steps 100 to 400 on a scene's training views. The rasterizer's two
+native calls are timed. The rest is harmonics, loss, optimizer and autograd. Run it without other work on the machine:
 ``python benchmarks/speed/training_step.py SCENE --downscale 2 --gaussians 20800``.
 """
 
@@ -35,7 +35,7 @@ PLAIN = RECIPES["3dgs"]
 
 
 class Stopwatch:
-    """Adds up the seconds spent in the calls that it wraps."""
+    """Sum of the seconds of wrapped calls."""
 
     def __init__(self) -> None:
         self.seconds = 0.0
@@ -51,7 +51,7 @@ class Stopwatch:
         return run
 
     def take(self) -> float:
-        """The seconds so far; then it starts again."""
+        """Return the seconds and reset them."""
         seconds, self.seconds = self.seconds, 0.0
         return seconds
 
@@ -67,7 +67,7 @@ def recipe_without_densification(added: int) -> Recipe:
 
 
 def with_gaussians(scene: Scene, wanted: int) -> tuple[Scene, Recipe]:
-    """The scene and a recipe that begin with ``wanted`` Gaussians: points are left out, or some repeated nearby."""
+    """Return the scene and a recipe that begin with ``wanted`` Gaussians. Points are left out or repeated nearby."""
     shell = min(PLAIN.initialization.shell, wanted // 2)
     count = wanted - shell
     generator = torch.Generator().manual_seed(0)

@@ -1,8 +1,8 @@
-"""Pictures a second of the viewer while the camera moves: drawn, encoded, and sent to a browser that does nothing.
+"""Measure the pictures per second of the viewer while the camera moves: drawn, encoded, and sent to an idle browser.
 
-``python benchmarks/speed/viewer.py RUN [--gaussians 50000] [--size 480x360]``; run it alone. The camera goes along an
-orbit, one pose a picture; the size is held. The Gaussians are a random choice of the run's (or all of them, some
-twice).
+``python benchmarks/speed/viewer.py RUN [--gaussians 50000] [--size 480x360]``. Run it without other work on the
+machine. The camera follows an orbit, one pose per picture, at a fixed size. The Gaussians are a random choice of the
+run's. If the run has too few, some are repeated.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def main() -> None:
     print(
         f"{shown.status}; {len(shown.gaussians):,} of them, {width} x {height}, {torch.get_num_threads()} threads"
     )
-    print("layer        ms (10 % to 90 %)   pictures a second")
+    print("layer        ms (10 % to 90 %)   pictures per second")
     for layer in LAYERS:
         painter, seconds = Painter(scene_frame(cameras)), []
         for camera in path:

@@ -44,9 +44,6 @@ from polarguide_bench.plan import jobs_at_a_time, own_gpus
 from polarguide_bench.report import recorded_health
 from polarguide_bench.tables import csv_text, formatted
 
-PAGE = "index.html"
-TABLE = "results.csv"
-
 
 @dataclass(frozen=True)
 class CaptureRow:
@@ -117,7 +114,7 @@ def write_page(out: Path, rows: Sequence[CaptureRow]) -> None:
             (row, [formatted(scores[row.name].get(column.key), column) for column in columns]) for row in rows
         ],
     )
-    write_text(out / PAGE, html)
+    write_text(out / "index.html", html)
     frame = pd.DataFrame(
         [
             {
@@ -131,7 +128,7 @@ def write_page(out: Path, rows: Sequence[CaptureRow]) -> None:
             for row in rows
         ]
     )
-    write_text(out / TABLE, csv_text(frame))
+    write_text(out / "results.csv", csv_text(frame))
 
 
 CAPTURES = "captures"

@@ -22,8 +22,6 @@ from polarguide_synth.render import Plan, expected_time, synthesize
 from polarguide_synth.schema import SceneSpec
 from polarguide_synth.settings import Overrides, find_scene
 
-SCENES = "scenes"
-
 
 def run_bench(
     out: PathLike,
@@ -61,7 +59,7 @@ def run_bench(
     reason = missing_package() if rows else None
     if reason is not None:
         reporter.warn(f"mesh scores will have no value: {reason}")
-    scenes = Path(out) / SCENES
+    scenes = Path(out) / "scenes"
     places = {name: scenes / spec.name for name, spec in specs.items()}
     states = {name: _state(places[name], spec, bench) for name, spec in specs.items()}
     threads = options.jobs * options.threads

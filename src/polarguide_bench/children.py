@@ -33,14 +33,10 @@ FORMAT = 1
 """Version of the record of a capture."""
 RECORD = "capture.json"
 """File of the record in the folder of a capture."""
-SCENE = "scene"
-"""Scene folder in the folder of a capture."""
 INSPECTION = "inspection"
 """Folder of the inspection."""
 RUN = "run"
 """Run folder."""
-EXPORT = "export"
-"""Folder of the exports."""
 SHARE = "share.html"
 """File of the shared page."""
 Step = Literal["prepare", "inspect", "train", "eval", "share", "export"]
@@ -174,8 +170,8 @@ def source_stamp(folder: Path) -> tuple[int, int, int]:
     for path in _files_below(folder):
         with contextlib.suppress(OSError, ValueError):  # removed in the meantime, or an invalid name
             states.append(os.stat(path))
-    newest = max((state.st_mtime_ns for state in states), default=0)
-    return len(states), sum(state.st_size for state in states), newest
+    sizes = sum(state.st_size for state in states)
+    return len(states), sizes, max((state.st_mtime_ns for state in states), default=0)
 
 
 def source_digest(folder: Path, earlier: Request | None, stamp: tuple[int, int, int]) -> str:

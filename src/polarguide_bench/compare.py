@@ -16,9 +16,17 @@ from msgspec import UNSET
 from polarguide import __version__
 from polarguide.capture.layout import refuse_scene
 from polarguide.capture.variants import EVERY
-from polarguide.core.errors import PolarguideError, require
+from polarguide.core.errors import require
 from polarguide.core.files import check_out, make_folder, require_inside, write_text
-from polarguide.core.options import MOST, ComputeOptions, Exposures, PathLike, check_choice, check_count
+from polarguide.core.options import (
+    MOST,
+    ComputeOptions,
+    Exposures,
+    PathLike,
+    check_choice,
+    check_count,
+    index_of,
+)
 from polarguide.core.progress import SILENT, Reporter
 from polarguide.core.records import decode
 from polarguide.core.system import only_writer
@@ -33,6 +41,7 @@ from polarguide_bench.plan import (
     Comparison,
     PlannedRun,
     SceneEntry,
+    compared_steps,
     jobs_at_a_time,
     most_memory,
     own_gpus,
@@ -53,7 +62,6 @@ from polarguide_bench.results import (
 )
 from polarguide_bench.tables import write_tables
 
-LOCK = ".lock"
 BESIDE_OTHERS = "beside_others.txt"
 """File that marks a run whose training shared the machine, so that its time does not count."""
 
@@ -157,20 +165,25 @@ def ablate(
     Raises:
         PolarguideError: see ``compare``; or a recipe without ablations, or an unknown ablation.
     """
-    recipes = [*reference, *ablated(base, only)]
-    options = replace(options, against=options.against or base)
-    return compare(scenes, recipes, out, settings=settings, options=options, reporter=reporter)
+    return compare(
+        scenes,
+        [*reference, *ablated(base, only)],
+        out,
+        settings=settings,
+        options=replace(options, against=options.against or base),
+        reporter=reporter,
+    )
 
 
-def _folder(scene: object) -> Path:
-    if isinstance(scene, str | os.PathLike):
-        return Path(scene)
-    raise PolarguideError(
+def _folder(scene: PathLike) -> Path:
+    require(
+        isinstance(scene, str | os.PathLike),
         "scenes",
         expected="paths of scene folders",
         found=f"a {type(scene).__name__}",
         remedy="Pass scene.root: other processes read the scene from its folder.",
     )
+    return Path(scene)
 
 
 def ablated(base: str, only: Sequence[str] = ()) -> tuple[str, ...]:
@@ -303,7 +316,7 @@ def locked(folder: Path, what: str = "comparison") -> contextlib.AbstractContext
     Children on this machine inherit the lock. If the parent is killed, they hold it until they have saved their states.
     """
     return only_writer(
-        folder / LOCK, expected="a folder that nobody is writing to", found=f"another {what} at work in it"
+        folder / ".lock", expected="a folder that nobody is writing to", found=f"another {what} at work in it"
     )
 
 
@@ -333,7 +346,7 @@ def collect(
             "date": datetime.now(timezone.utc).isoformat(timespec="seconds"),
         },
         "settings": {
-            "steps": comparison.steps,
+            "steps": compared_steps(settings.steps),
             "seeds": options.seeds,
             "downscale": options.downscale,
             "transfer": options.transfer,
@@ -352,7 +365,9 @@ def collect(
                 test_views=list(scene.test_views),
                 black_share=scene.black_share,
                 warnings=list(scene.warnings) or UNSET,
-                refractive_index=comparison.index_of(scene) if settings.refractive_index is None else UNSET,
+                refractive_index=UNSET
+                if settings.refractive_index is not None
+                else index_of(None, scene.refractive_index),
             )
             for scene in scenes
         ],

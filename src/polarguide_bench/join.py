@@ -246,8 +246,7 @@ def join_tables(
     if layout is not None:
         check_choice("layout", layout, list(LAYOUTS))
         write_publication_tables(Path(out), joined, LAYOUTS[layout])
-    html = report_html(joined, [], {}, ["Pictures are in the reports of the parts."])
-    write_text(Path(out) / REPORT, html)
+    write_text(Path(out) / REPORT, report_html(joined, [], {}, ["Pictures are in the reports of the parts."]))
     return joined
 
 

@@ -22,7 +22,6 @@ from polarguide_synth.settings import SynthSettings
 
 MOST_SEEDS = 1000
 """Largest number of seeds. Each recipe and scene has a run for each seed."""
-Manager = Literal["slurm", "pbs"]
 LayoutName = Literal["publication-1", "publication-2"]
 """Tables of PolarGuide-GSDR: its comparison of methods, and its ablations."""
 
@@ -60,7 +59,7 @@ class ClusterOptions:
         )
 
     @property
-    def manager(self) -> Manager | None:
+    def manager(self) -> Literal["slurm", "pbs"] | None:
         """Manager of the cluster, if any."""
         if self.slurm:
             return "slurm"
@@ -84,9 +83,10 @@ class CompareOptions(ClusterOptions, SceneOptions):
         device: Device of trainings and renderings.
         against: Reference recipe. Tables show the difference of every other recipe to it.
         exposures: Kinds of captures, a row of the tables each, simulated from a scene with four pictures of each view.
-            four: all four. three: 0, 60 and 120 degrees. two: two at right angles. one: one. unknown: one, at an
-            unknown angle. mixed: four of every fourth view, the others without a filter. sparse: every fourth view
-            alone. none: no filter, and no polarization in the recipe.
+            The values four, three (0, 60 and 120 degrees), two (at right angles), one and unknown (one at an unknown
+            angle) hold for each view. The value mixed has four pictures of every fourth view, and the others without a
+            filter. The value sparse has only every fourth view. The value none has no filter, and no polarization in
+            the recipe.
     """
 
     seeds: int = 1
@@ -130,9 +130,6 @@ class BatchOptions(ClusterOptions):
 
     formats: tuple[ExportFormat, ...] = ("ply",)
     device: DeviceName = "auto"
-
-
-Half = Literal["development", "held-back"]
 
 
 @dataclass(frozen=True)
@@ -198,7 +195,7 @@ class BenchOptions(ClusterOptions):
     device: DeviceName = "auto"
 
     @property
-    def half(self) -> Half:
+    def half(self) -> Literal["development", "held-back"]:
         """Requested half."""
         return "held-back" if self.held_back else "development"
 

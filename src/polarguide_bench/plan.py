@@ -40,7 +40,6 @@ from polarguide_bench.options import ClusterOptions, CompareOptions
 from polarguide_bench.recipes import AnyRecipe, ablations_of, recipe_named
 
 State = Literal["new", "begun", "trained", "done"]
-RUNS = "runs"
 
 
 @dataclass(frozen=True)
@@ -92,11 +91,6 @@ class Comparison:
     command_line: str = ""
 
     @property
-    def steps(self) -> int:
-        """Steps of each run whose recipe has no own number."""
-        return compared_steps(self.settings.steps)
-
-    @property
     def rows(self) -> tuple[TableRow, ...]:
         """Rows of the tables in their order."""
         rows = []
@@ -112,10 +106,6 @@ class Comparison:
                 rows.append(TableRow(name, control, exposures, steps))
         return tuple(rows)
 
-    def index_of(self, scene: SceneEntry) -> float:
-        """Return the refractive index of a scene's runs: the index of the settings, or that of the scene."""
-        return index_of(self.settings.refractive_index, scene.refractive_index)
-
     @property
     def command(self) -> str:
         """Command line that requests the same comparison."""
@@ -123,7 +113,10 @@ class Comparison:
         options = self.options
         arguments: dict[str, Sequence[object]] = {
             "--recipes": [recipe.name for recipe in self.recipes],
-            "--steps": [self.steps, *(f"{name}={n}" for name, n in self.steps_of.items())],
+            "--steps": [
+                compared_steps(settings.steps),
+                *(f"{name}={n}" for name, n in self.steps_of.items()),
+            ],
             "--seeds": [options.seeds],
             "--out": [self.out],
             "--downscale": [options.downscale],
@@ -287,13 +280,12 @@ def black_share(view: View) -> float:
 
 def plan_runs(comparison: Comparison, scenes: Sequence[SceneEntry]) -> list[PlannedRun]:
     """Return all runs, scene by scene, then seed by seed, so that the first results compare all recipes."""
-    first = comparison.settings.seed
     counts = {
         row.name: comparison.seeds_of.get(row.recipe.name, comparison.options.seeds)
         for row in comparison.rows
     }
     return [
-        _planned(comparison, scene, row, first + number)
+        _planned(comparison, scene, row, comparison.settings.seed + number)
         for scene in scenes
         for number in range(max(counts.values()))
         for row in comparison.rows
@@ -310,14 +302,14 @@ def _planned(comparison: Comparison, scene: SceneEntry, row: TableRow, seed: int
         steps=steps,
         seed=seed,
         exposures=row.exposures,
-        refractive_index=comparison.index_of(scene),
+        refractive_index=index_of(comparison.settings.refractive_index, scene.refractive_index),
     )
     reading = SceneOptions(options.downscale, options.transfer, split=options.split)
     plugin = model_digest(type(recipe.shading)) if isinstance(recipe, Recipe) else ""
     code = f"{__version__} {code_digest(training=True)}{plugin}"
     key = run_key(scene.digest, recipe.data(), settings, reading, code=code)
     name = row.name.replace(":", "__").replace(" ", "-")
-    folder = comparison.out / RUNS / scene.name / name / f"{seed}-{key}"
+    folder = comparison.out / "runs" / scene.name / name / f"{seed}-{key}"
     return PlannedRun(scene, row, steps, settings, reading, folder)
 
 

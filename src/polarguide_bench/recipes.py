@@ -1,6 +1,6 @@
-"""Recipes of comparisons: those of the product, its ablations, and GNeRP.
+"""Recipes of comparisons: the recipes of the product, their ablations, and GNeRP.
 
-An ablation is a recipe with one thing changed, each a piece of data.
+An ablation is a recipe with one change, defined as data.
 """
 
 from __future__ import annotations
@@ -33,34 +33,28 @@ from polarguide.training.recipe import Recipe, Weights
 from polarguide_bench.gnerp.recipe import FieldRates, FieldShape, NeuralRecipe, Sampling
 
 AnyRecipe = Recipe | NeuralRecipe
-"""The recipes that a comparison trains."""
+"""Recipe of a comparison."""
 
 
 def priors(**values: Any) -> Change:
-    """New values of the recipe's ``Priors``."""
+    """Change values of the recipe's ``Priors``."""
     return lambda recipe: replace(recipe, priors=replace(recipe.priors, **values))
 
 
 def shading(**values: Any) -> Change:
-    """New values of the shading model."""
+    """Change values of the shading model."""
     return lambda recipe: replace(recipe, shading=replace(recipe.shading, **values))
 
 
-def without_propagation(base: Recipe) -> Recipe:
-    """Neither propagations nor resets of the opacities."""
-    bare = staged(lambda stage: replace(stage, rounds=None))
-    return both(bare, without("reset_opacity"))(base)
-
-
 def firm_to_the_end(base: Recipe) -> Recipe:
-    """The final stage keeps rates and weights (but those of the layers) of the guided one."""
+    """Use rates and weights of the guided stage in the final stage, except the weights of the layers."""
     *before, final = base.stages
     weights = replace(before[-1].weights, specular=0.0, diffuse=0.0)
     return replace(base, stages=(*before, replace(final, weights=weights, rate_factors={})))
 
 
 def release_rates(**others: float) -> Change:
-    """The geometry learns as slowly as in the release of 3DGS; ``others``: more rates of it."""
+    """Use the rates of the geometry of the 3DGS release. ``others`` are further rates of it."""
     slow = {"means": 1.6e-4, "log_scales": 5e-3, **others}
     return lambda recipe: replace(recipe, rates={**recipe.rates, **slow}, means_decay=0.01)
 
@@ -68,29 +62,29 @@ def release_rates(**others: float) -> Change:
 _NORMAL_TERMS_OFF = off("normal", "azimuth", "chromatic", "consistency")
 _UNPOLARIZED_INCONSISTENT = (
     "unpolarized-without-consistency",
-    "The same without any polarization, and normals need not agree with the depth.",
+    "Without polarization and without agreement of normals and depth.",
     both(off(*POLARIZED_TERMS, "consistency"), without("refresh_priors")),
 )
 _COMMON = (
     (
         "without-colour",
-        "Nothing is read from the polarization of color differences.",
+        "Without the polarization of color differences.",
         both(off("chromatic"), priors(chromatic=False)),
     ),
     (
         "colour-unchecked",
-        "Normals of gray bodies' color differences count however far the Gaussians' normals are from them.",
+        "Normals from color differences count at any distance from the Gaussians' normals.",
         priors(chromatic_within=None),
     ),
     (
         "without-easing",
-        "Every term weighs as much in the final stage as before, and rotations learn as fast.",
+        "The final stage has the weights and rates of the previous stage.",
         firm_to_the_end,
     ),
-    ("without-consistency", "Normals need not agree with the depth.", off("consistency")),
+    ("without-consistency", "Without agreement of normals and depth.", off("consistency")),
     (
         "consistency-by-dolp",
-        "Normals agree with the depth only where the light is polarized.",
+        "Normals and depth agree only on polarized pixels.",
         priors(bright=0.0),
     ),
     (
@@ -100,27 +94,27 @@ _COMMON = (
     ),
     (
         "without-planes",
-        "Large flat surfaces are not looked for.",
+        "Without a search for large flat surfaces.",
         priors(flat=False),
     ),
     (
         "layers-turn-normals",
-        "Gradients of the layer terms reach the normals through the reflection from the beginning.",
+        "Gradients of the layer terms reach the normals through the reflection in all stages.",
         staged(lambda stage: replace(stage, hold_normals=False)),
     ),
     (
         "layers-hold-normals",
-        "The terms on the layers reach the normals through Fresnel's equations alone, to the end.",
+        "Gradients of the layer terms reach the normals only through Fresnel's equations in all stages.",
         staged(lambda stage: replace(stage, hold_normals=True)),
     ),
     (
         "few-pixels-pull",
-        "The terms on directions are averaged over polarized pixels alone, however few.",
+        "The terms on directions are means over polarized pixels only.",
         priors(azimuth_share=0.0, chromatic_share=0.0),
     ),
     (
         "release-rates",
-        "Means and scales learn as slowly as in the release of 3DGS, which takes 30,000 steps.",
+        "Rates of means and scales of the 3DGS release, which trains for 30,000 steps.",
         release_rates(),
     ),
     UNPOLARIZED,
@@ -131,7 +125,7 @@ ABLATIONS_3DGS = varied(
     RECIPE_3DGS,
     (
         "release-rates",
-        "The geometry learns as slowly as in the release, which takes 30,000 steps.",
+        "Rates of the geometry of the release, which trains for 30,000 steps.",
         release_rates(quaternions=1e-3),
     ),
 )
@@ -140,7 +134,7 @@ ABLATIONS_3DGS_DR = varied(
     RECIPE_3DGS_DR,
     (
         "consistent",
-        "Flat Gaussians whose normals agree with the depth: what geometry gives without polarization.",
+        "Flat Gaussians with agreement of normals and depth: geometry without polarization.",
         staged(
             lambda stage: replace(
                 stage, weights=replace(stage.weights, consistency=0.05, flatness=0.1), behind=BEHIND
@@ -149,33 +143,33 @@ ABLATIONS_3DGS_DR = varied(
     ),
     (
         "without-propagation",
-        "Neither propagations nor resets of the opacities: the row to compare with on real captures.",
-        without_propagation,
+        "Without propagations and resets of the opacities: the reference on real captures.",
+        both(staged(lambda stage: replace(stage, rounds=None)), without("reset_opacity")),
     ),
 )
 
 
 def layers_before_the_blend(weights: Weights) -> Weights:
-    """The terms on the layers compare mirrored light and base color, before the blend with the reflection strength."""
+    """Compare mirrored light and base color before the blend with the reflection strength."""
     return replace(weights, specular=0.0, diffuse=0.0, reflection=weights.specular, base=weights.diffuse)
 
 
 def layers_after_the_blend(weights: Weights) -> Weights:
-    """The terms on the layers compare what each adds to the picture."""
+    """Compare the contributions of the layers to the picture."""
     return replace(weights, specular=weights.reflection, diffuse=weights.base, reflection=0.0, base=0.0)
 
 
 _PUBLISHED = (
-    ("only-normals", "Polarization normals alone: no term on the layers.", off(*LAYER_TERMS)),
-    ("without-normals", "Separated layers alone: no term on the normals.", off("normal")),
+    ("only-normals", "Only polarization normals, without terms on the layers.", off(*LAYER_TERMS)),
+    ("without-normals", "Only separated layers, without terms on the normals.", off("normal")),
     (
         "counted-pixels",
-        "The term on the normals is divided by the pixels that count, not by all.",
+        "The term on the normals is a mean over valid pixels instead of all.",
         priors(azimuth_share=0.0),
     ),
     UNPOLARIZED,
 )
-"""The two ablations of the publication, another reading of its normal term, and the control."""
+"""The two ablations of the publication, another interpretation of its normal term, and the control."""
 
 ABLATIONS_PAPER = (
     RECIPE_POLARGUIDE_PAPER_KIND,
@@ -184,7 +178,7 @@ ABLATIONS_PAPER = (
         *_PUBLISHED,
         (
             "after-the-blend",
-            "The layers are compared after the blend with the reflection strength.",
+            "Layers are compared after the blend with the reflection strength.",
             weighing(layers_after_the_blend),
         ),
     ),
@@ -194,7 +188,7 @@ ABLATIONS_KIND = varied(
     *_PUBLISHED,
     (
         "before-the-blend",
-        "The layers are compared before the blend with the reflection strength.",
+        "Layers are compared before the blend with the reflection strength.",
         weighing(layers_before_the_blend),
     ),
 )
@@ -203,63 +197,63 @@ ABLATIONS_POLARGUIDE = varied(
     RECIPE_POLARGUIDE,
     (
         "only-normals",
-        "Polarization normals alone: no term on the separated layers.",
+        "Only polarization normals, without terms on the separated layers.",
         off("specular", "diffuse"),
     ),
-    ("without-normals", "Separated layers alone: no term on the normals.", _NORMAL_TERMS_OFF),
+    ("without-normals", "Only separated layers, without terms on the normals.", _NORMAL_TERMS_OFF),
     (
         "without-polar-normals",
-        "No polarization normals, but normals still agree with the depth.",
+        "Without polarization normals, but with agreement of normals and depth.",
         off("normal", "azimuth", "chromatic"),
     ),
     (
         "paper-candidates",
-        "PolarGuide-GSDR's four candidates in place of the six that physics allows.",
+        "PolarGuide-GSDR's four candidates instead of the six physical ones.",
         priors(candidates="paper"),
     ),
     (
         "paper-separation",
-        "PolarGuide-GSDR's separation cue in place of the exact solution.",
+        "PolarGuide-GSDR's separation cue instead of the exact solution.",
         priors(separation="paper"),
     ),
     (
         "without-azimuth-weighting",
-        "Zenith trusted like azimuth, in the choice and in the term.",
+        "The zenith has the weight of the azimuth, in the choice and in the term.",
         both(weighing(lambda old: replace(old, azimuth=0.0, normal=old.azimuth)), priors(azimuth_weight=0.0)),
     ),
     (
         "without-refresh",
-        "Priors computed once, not again as the Gaussians improve.",
+        "Priors are computed only once.",
         without("refresh_priors"),
     ),
     (
         "without-mask",
-        "Every pixel's polarization counts fully, however weak and noisy.",
+        "The polarization of each pixel has full weight, even if it is weak or noisy.",
         priors(threshold=0.0, full_dolp=1e-6, snr=0.0),
     ),
     *_COMMON,
-    ("without-flatness", "Gaussians need not be flat.", off("flatness")),
+    ("without-flatness", "Without the flatness of Gaussians.", off("flatness")),
 )
 
 ABLATIONS_STOKES = varied(
     RECIPE_POLARGUIDE_STOKES,
-    ("without-stokes", "S1 and S2 are not rendered.", off("stokes")),
-    ("without-separation", "No term on the separated layers.", off("specular", "diffuse")),
-    ("without-normals", "No term on the normals except that on S1 and S2.", _NORMAL_TERMS_OFF),
+    ("without-stokes", "Without rendered S1 and S2.", off("stokes")),
+    ("without-separation", "Without terms on the separated layers.", off("specular", "diffuse")),
+    ("without-normals", "Without terms on the normals, except the term on S1 and S2.", _NORMAL_TERMS_OFF),
     (
         "without-fresnel",
-        "Strength does not depend on the angle: the lerp of 3DGS-DR.",
+        "The reflection strength does not depend on the angle: the lerp of 3DGS-DR.",
         shading(blend="lerp", first_strength=0.05, rough=False),
     ),
     (
         "without-roughness",
-        "Dielectrics are mirrors; metals alone have a roughness.",
+        "Only metals have a roughness. Dielectrics are mirrors.",
         shading(rough=False),
     ),
-    ("without-local", "Nothing near is reflected: the environment alone.", shading(local=False)),
+    ("without-local", "Only the environment is reflected, without near light.", shading(local=False)),
     (
         "without-outer-side",
-        "Normals are always turned to the camera.",
+        "Normals always face the camera.",
         both(without("orient_normals"), lambda recipe: replace(recipe, oriented=False)),
     ),
     *_COMMON,
@@ -289,7 +283,7 @@ ABLATIONS_GNERP = (
 )
 
 FIELDS: dict[str, NeuralRecipe] = {recipe.name: recipe for recipe in (RECIPE_GNERP, *ABLATIONS_GNERP)}
-"""Recipes of signed-distance fields, which comparisons alone train."""
+"""Recipes of signed-distance fields by name. Only comparisons train them."""
 
 ABLATIONS: dict[str, tuple[AnyRecipe, ...]] = {
     "3dgs": ABLATIONS_3DGS,
@@ -300,16 +294,16 @@ ABLATIONS: dict[str, tuple[AnyRecipe, ...]] = {
     "polarguide-stokes": ABLATIONS_STOKES,
     "gnerp": ABLATIONS_GNERP,
 }
-"""Variations of a recipe by its name, each with one thing changed, named ``recipe:variation``."""
+"""Ablations of a recipe by its name. Their names are ``recipe:variation``."""
 
 VARIATIONS: dict[str, Recipe] = {
     recipe.name: recipe for recipes in ABLATIONS.values() for recipe in recipes if isinstance(recipe, Recipe)
 }
-"""All ablations of Gaussians by name; the product looks names with a colon up here."""
+"""All ablations of Gaussians by name. The product finds names with a colon here."""
 
 
 def recipe_named(name: str) -> AnyRecipe:
-    """A recipe or an ablation by name.
+    """Return a recipe or an ablation by name.
 
     Raises:
         PolarguideError: see ``polarguide.recipes.recipe_named``.
@@ -318,10 +312,10 @@ def recipe_named(name: str) -> AnyRecipe:
 
 
 def ablations_of(name: str) -> tuple[AnyRecipe, ...]:
-    """The ablations of a recipe: ours, or those that a plug-in offers as ``name:variation``; there may be none.
+    """Return the ablations of a recipe, which may be none. Plug-ins offer theirs as ``name:variation``.
 
     Raises:
-        PolarguideError: there is no recipe of that name.
+        PolarguideError: an unknown recipe.
     """
     if name in ABLATIONS or name in registry.RECIPES:
         return ABLATIONS.get(name, ())

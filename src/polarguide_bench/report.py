@@ -123,9 +123,13 @@ def chart(
     size: tuple[int, int] = (430, 330),
 ) -> str:
     """Return an SVG file. Colors follow the order of the legend; ``size`` is the width and height of a panel."""
-    template = templates(BASE).get_template("chart.svg")
-    return template.render(
-        dashes=DASHES, panels=panels, legend=legend, lines=lines, label=label, width=size[0], height=size[1]
+    width, height = size
+    return (
+        templates(BASE)
+        .get_template("chart.svg")
+        .render(
+            dashes=DASHES, panels=panels, legend=legend, lines=lines, label=label, width=width, height=height
+        )
     )
 
 
@@ -163,8 +167,8 @@ def curves_svg(curves: Sequence[Curve], axis: str) -> str:
     series = [
         Series(c.name, [(x, y, "") for x, y in zip(getattr(c, axis), c.psnr, strict=True)]) for c in curves
     ]
-    panels = [panel("PSNR (dB), training views", axis, series)]
-    return chart(panels, (), label=f"PSNR over {axis}", size=(860, 340))
+    axes = panel("PSNR (dB), training views", axis, series)
+    return chart([axes], (), label=f"PSNR over {axis}", size=(860, 340))
 
 
 def read_study(scene: Path) -> tuple[str, float] | None:
@@ -322,8 +326,6 @@ ERROR_SHEET = "errors.png"
 """File of the error maps in a run folder."""
 PICTURE_BYTES = 28_000_000
 """Largest size of all pictures of a report. Browsers and mail programs can still handle the file."""
-GROUND_TRUTH = "ground truth"
-PHOTOGRAPH = "photograph"
 LAYER_METRICS = {
     "final": "psnr",
     "diffuse": "diffuse_psnr",
@@ -381,8 +383,9 @@ def write_report(
                 views += [view] if view is not None else []
                 remarks += [remark] if remark is not None else []
                 advance(count)
-    html = report_html(results, views, curves, remarks, sheets, _health(finished))
-    write_text(comparison.out / REPORT, html)
+    write_text(
+        comparison.out / REPORT, report_html(results, views, curves, remarks, sheets, _health(finished))
+    )
 
 
 def _health(runs: Sequence[PlannedRun]) -> list[str]:
@@ -418,7 +421,7 @@ def _ground_truth_tile(scene: Scene, view: View) -> Tile:
     if ids is not None and metals:
         mask = torch.isin(ids, torch.tensor(metals, dtype=ids.dtype))
         pictures["metalness"] = figures.scalar_to_rgb(mask.float(), 0.0, 1.0, "inferno")
-    return Tile(GROUND_TRUTH if view.ground_truth is not None else PHOTOGRAPH, pictures, {})
+    return Tile("photograph" if view.ground_truth is None else "ground truth", pictures, {})
 
 
 def _tile(name: str, run: OpenedRun | FieldRun, view: View, scores: Mapping[str, float | None]) -> Tile:

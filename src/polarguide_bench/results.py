@@ -317,8 +317,7 @@ def shared(values: Numbers) -> Numbers:
 
 def paired(of: Numbers, other: Numbers) -> Numbers:
     """Return the differences ``of - other`` [seeds, units] at the seeds and units that both have; see ``shared``."""
-    both = shared(np.stack([of, other]))
-    return np.asarray(both[0] - both[1])
+    return np.asarray(np.subtract(*shared(np.stack([of, other]))))
 
 
 def known(values: Numbers) -> list[float]:
@@ -617,11 +616,6 @@ class Results:
                 finished = len(scored) if scene is None else scored.count(scene)
                 rows.append(ScoreRow(scene, recipe, finished, cells))
         return rows
-
-    def content(self) -> dict[str, Any]:
-        """Return the content of ``results.json``."""
-        tables = {"table": [row._asdict() for row in self.table], "differences": self.compared}
-        return {**msgspec.to_builtins(self.record), **msgspec.to_builtins(tables)}
 
 
 def _over_scenes(numbers: Sequence[Any]) -> Cell:

@@ -10,6 +10,7 @@ from pathlib import Path
 from statistics import fmean
 from typing import Any, NamedTuple
 
+import msgspec
 import numpy as np
 import pandas as pd
 from msgspec import UNSET
@@ -42,7 +43,6 @@ from polarguide_bench.results import (
 
 BY_KEY = {metric.key: metric for metric in COLUMNS}
 NOT_APPLICABLE = "n/a"
-MEAN_TITLE = "mean over scenes"
 OVER_SCENES = "over scenes"
 MINUS = "\N{MINUS SIGN}"
 _DIFFERENCE_NOTES = (
@@ -136,7 +136,7 @@ def scores_section(results: Results) -> Section:
             )
             for index, row in enumerate(rows)
         ]
-        blocks.append((scene or MEAN_TITLE, parts))
+        blocks.append((scene or "mean over scenes", parts))
     return Section("scores", "", ("recipe",), [c.heading for c in columns], blocks, notes(results))
 
 
@@ -251,10 +251,13 @@ def control_section(results: Results) -> Section:
         for d in compared
         if d["left_out"]
     )
-    headings = [column.heading for column in columns]
-    labels = ("scene", "interval over")
     return Section(
-        "controls", "Gain by polarization", labels, headings, blocks, [*stated, *_DIFFERENCE_NOTES]
+        "controls",
+        "Gain by polarization",
+        ("scene", "interval over"),
+        [column.heading for column in columns],
+        blocks,
+        [*stated, *_DIFFERENCE_NOTES],
     )
 
 
@@ -271,9 +274,14 @@ def against_section(results: Results) -> Section:
             if recipe != against
         ]  # fmt: skip
         blocks.append((scene or OVER_SCENES, rows))
-    headings = [column.heading for column in columns]
-    title = f"Differences to {against}"
-    return Section("against", title, ("recipe", "interval over"), headings, blocks, [*_DIFFERENCE_NOTES])
+    return Section(
+        "against",
+        f"Differences to {against}",
+        ("recipe", "interval over"),
+        [column.heading for column in columns],
+        blocks,
+        [*_DIFFERENCE_NOTES],
+    )
 
 
 def _places(results: Results) -> list[str | None]:
@@ -362,9 +370,14 @@ def part_section(results: Results, kind: str) -> Section:
         )
     if kind == "material":
         stated.append("Means over the scenes that contain the material. All scenes have the same weight.")
-    headings = [*results.recipes, *(f"{recipe} {MINUS} control" for recipe in with_controls)]
-    titles = ("scene", "object", "material") if kind == "object" else ("material", "scenes")
-    return Section(f"{kind}s", f"By {kind}", titles, headings, blocks, stated)
+    return Section(
+        f"{kind}s",
+        f"By {kind}",
+        ("scene", "object", "material") if kind == "object" else ("material", "scenes"),
+        [*results.recipes, *(f"{recipe} {MINUS} control" for recipe in with_controls)],
+        blocks,
+        stated,
+    )
 
 
 def _part_score(kind: str, labels: Sequence[str], key: str, run: RunRecord) -> dict[str, float | None]:
@@ -422,7 +435,12 @@ _TEXTS.filters.update(md=markdown_text, tex=latex_text, printable=printable)
 
 def write_tables(out: Path, results: Results) -> None:
     """Write ``results.json``, ``.md``, ``.csv`` and ``.tex``, and differences and parts as CSV, each atomically."""
-    write_text(out / "results.json", json.dumps(results.content(), indent=1, allow_nan=False) + "\n")
+    content = {
+        **msgspec.to_builtins(results.record),
+        "table": [msgspec.to_builtins(row._asdict()) for row in results.table],
+        "differences": msgspec.to_builtins(results.compared),
+    }
+    write_text(out / "results.json", json.dumps(content, indent=1, allow_nan=False) + "\n")
     tables = sections(results)
     for name in ("results.md", "results.tex"):
         write_text(out / name, readable(tables, name))

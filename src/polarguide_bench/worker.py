@@ -40,11 +40,9 @@ from polarguide.visualization import figures
 from polarguide.visualization.figures import layer_picture
 from polarguide.visualization.pages import data_uri
 from polarguide_bench.children import (
-    EXPORT,
     FORMAT,
     INSPECTION,
     RUN,
-    SCENE,
     SHARE,
     STEPS,
     CaptureRecord,
@@ -75,7 +73,7 @@ def process(task: Processing) -> None:
     make_folder(folder)
     record = CaptureRecord.load(folder) or CaptureRecord(FORMAT, task.request)
     record.require(task.request, folder)
-    scene = Path(task.request.source) if task.request.prepare is None else folder / SCENE
+    scene = Path(task.request.source) if task.request.prepare is None else folder / "scene"
     for step in STEPS:
         if step not in record.done:
             record = msgspec.structs.replace(record, at=step)
@@ -146,7 +144,7 @@ def _share(task: Processing, scene: Path, folder: Path) -> None:
 
 def _export(task: Processing, scene: Path, folder: Path) -> dict[str, Any]:
     run = OpenedRun.open(folder / RUN, device=task.compute.device)
-    files = [path for kind in task.request.formats for path in formats.export(run, kind, folder / EXPORT)]
+    files = [path for kind in task.request.formats for path in formats.export(run, kind, folder / "export")]
     return {"files": tuple(path.relative_to(folder).as_posix() for path in files)}
 
 

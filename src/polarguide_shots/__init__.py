@@ -1,5 +1,5 @@
-"""One exposure set without poses: its maps, their uncertainty, and which pixels say nothing.
+"""Polarization maps of single shots without poses, measurement of shots, and calibration of sensors.
 
-``exposures`` lists the exposure sets behind paths, ``read`` reads one into ``ShotMaps``, ``write`` writes the maps of
-many. Importing ``options`` does not load torch.
+``exposures`` finds the exposure sets in paths, ``read`` reads a set into ``ShotMaps``, and ``write`` writes the maps of
+many sets. The import of ``options`` does not load torch.
 """

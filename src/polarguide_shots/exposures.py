@@ -90,8 +90,13 @@ def list_shots(
     shots: list[ExposureSet] = []
     files: list[Path] = []
     for path in map(Path, dict.fromkeys(paths)):
-        exists = path.is_dir() or path.is_file()
-        require(exists, path, expected="a file or folder of shots", found="none", remedy="Check the path.")
+        require(
+            path.is_dir() or path.is_file(),
+            path,
+            expected="a file or folder of shots",
+            found="none",
+            remedy="Check the path.",
+        )
         if path.is_file():
             files.append(path)
         else:
@@ -183,9 +188,11 @@ def _or_fault(
     except PolarguideError as error:
         fault = error
     except OSError as error:
-        found = error.strerror or str(error)
         fault = PolarguideError(
-            folder, expected="a readable folder", found=found, remedy="Check its permissions."
+            folder,
+            expected="a readable folder",
+            found=error.strerror or str(error),
+            remedy="Check its permissions.",
         )
     return [ExposureSet(folder.resolve().name, "filter", {}, fault=fault, others=(folder,))]
 
@@ -249,8 +256,9 @@ def _views(layout: CaptureFiles) -> list[ExposureSet]:
             except PolarguideError as error:
                 fault = error
         files = layout.pictures.get(name, {})
-        more = tuple(path for path, _ in others)
-        shots.append(ExposureSet(name, "scene", files, layout.root, name, fault, more))
+        shots.append(
+            ExposureSet(name, "scene", files, layout.root, name, fault, tuple(path for path, _ in others))
+        )
     faults = [shot.fault for shot in shots if shot.fault is not None]
     if shots and len(faults) == len(shots):
         raise faults[0]
@@ -291,8 +299,12 @@ def name_fault(shot: ExposureSet) -> PolarguideError | None:
     name = shot.name
     if name not in ("", ".", "..") and os.sep not in name and not (os.altsep and os.altsep in name):
         return None
-    expected = "a name that is valid for a folder"
-    return PolarguideError(shot.paths[0], expected=expected, found=repr(name), remedy="Rename the file.")
+    return PolarguideError(
+        shot.paths[0],
+        expected="a name that is valid for a folder",
+        found=repr(name),
+        remedy="Rename the file.",
+    )
 
 
 def require_own_folder(shot: ExposureSet, folder: Path) -> None:

@@ -277,9 +277,8 @@ def _fill(maps: dict[str, Any], part: slice, samples: SetSamples, model: SetMode
     spread = optics.fitted_uncertainty(stokes, torch.from_numpy(fit.covariance))
     degree = optics.dolp(stokes)
     maps["stokes"][:, part] = fit.stokes.reshape(3, *size)
-    angle = optics.aolp(stokes)
     for key, tensor in zip(
-        _FLOAT_MAPS, (degree, spread.debiased, angle, spread.dolp, spread.aolp), strict=False
+        _FLOAT_MAPS, (degree, spread.debiased, optics.aolp(stokes), spread.dolp, spread.aolp), strict=False
     ):
         maps[key][part] = tensor.reshape(size).numpy()
     if count > 3:

@@ -166,7 +166,7 @@ def estimated_noise(intensities: Any, usable: NDArray[np.bool_], step: float) ->
 
     Args:
         intensities: four arrays of one shape, by angle, of cells or of pixels.
-        usable: mask in this shape of samples that are neither dark nor saturated.
+        usable: mask in this shape of samples that are not dark or saturated.
         step: one stored value as a share of full scale, which bounds the noise from below.
     """
     chosen = np.flatnonzero(usable)
@@ -252,8 +252,9 @@ def interpolation_factors(sensor: str, x: int, y: int, mode: str) -> tuple[NDArr
     for row, column in np.ndindex(cell, cell):
         picture = np.zeros((side, side), np.float32)
         picture[row::_REACH, column::_REACH] = 1
-        valid = np.zeros(picture.shape, bool)
-        developed = demosaic(picture, valid, pattern, mode=way, interpolation="bilinear", colored=False)
+        developed = demosaic(
+            picture, np.zeros(picture.shape, bool), pattern, mode=way, interpolation="bilinear", colored=False
+        )
         response = developed.intensities.mean(axis=-1, dtype=np.float64)
         if mode == "half":
             response = response.reshape(len(ANGLES), side // 2, 2, side // 2, 2).mean(axis=(2, 4))

@@ -1,4 +1,4 @@
-"""Options of shots, of measurements and of watched folders. This module imports neither torch nor OpenCV."""
+"""Options of shots, of measurements and of watched folders. This module does not import torch or OpenCV."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``read_shot``: the maps of one exposure set, of files or of arrays in memory."""
+"""Reading of a shot from files or arrays (``read_shot``), and its normals and layers (``surface_maps``)."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ from polarguide.capture.view_reader import (
     read_view,
     stored_pictures,
 )
-from polarguide.core.errors import PolarguideError
+from polarguide.core.errors import PolarguideError, require
 from polarguide.core.files import require_file
 from polarguide.core.options import check_finite, index_of
 from polarguide.core.text import decimals
@@ -88,9 +88,9 @@ from polarguide_shots.samples import (
 from polarguide_shots.sets import ExposureSet, require_determined
 
 UNREADABLE = (PolarguideError, OSError, MemoryError)
-"""What one bad file may raise; others come after it."""
+"""Exceptions of one shot that do not stop the others."""
 _TILE = 1 << 18
-"""Pixels that are worked on at a time, so that what is between stays in the processor's cache."""
+"""Batch size in pixels. Intermediate results then stay in the processor's cache."""
 
 
 def read_shot(
@@ -105,17 +105,23 @@ def read_shot(
     angles: Sequence[Angle] = ANGLES,
     part: Part | None = None,
 ) -> ShotMaps:
-    """Read one exposure set: S0, DoLP, AoLP, their standard deviations, and which pixels say nothing.
+    """Read one exposure set: S0, DoLP, AoLP, their standard deviations, and the reasons against pixels.
+
+    A shot is one of these:
+
+    - a result of ``find_shots``, or a view of a scene
+    - the path of a mosaic, of a video with its table, or of a folder with one shot
+    - the paths of shots through a filter at three or more angles
+    - with ``options.sensor``, a raw mosaic [H, W] of uint8 or uint16 in NumPy or torch
+    - pictures through a filter, [K, H, W] or [K, H, W, 3] RGB, or a list of K arrays: integers as stored, or linear
+      floats from 0 to 1
 
     Args:
-        shot: of ``find_shots``; a view of a scene; or the path of a mosaic or of a video with its table, the paths of
-            shots through a filter at four or any three or more angles, or a folder with one shot. Or arrays of NumPy
-            or torch: with ``options.sensor`` a raw mosaic [H, W] of uint8 or uint16; else pictures through a filter,
-            [K, H, W] or [K, H, W, 3] RGB (or K of them), whole numbers as stored or linear floats from 0 to 1.
-        options: how to read it.
-        part: x, y, width and height of what is wanted of the picture of a mosaic: the rest is left out where that saves
-            time, as ``ShotMaps.origin`` and ``whole`` say. Noise that is not given is then estimated from the part.
-        angles: angles of the K pictures of an array, degrees counter-clockwise as displayed; files state theirs.
+        shot: the shot.
+        options: options of reading.
+        angles: angles of the K pictures of an array, degrees counter-clockwise as displayed. Files state their angles.
+        part: requested part of the picture of a mosaic. The rest is skipped if that saves time, see ``ShotMaps.origin``
+            and ``ShotMaps.whole``. The noise is then estimated from the part unless the options state it.
 
     Raises:
         PolarguideError: the path is not one shot, a file is missing, cannot be read, or does not fit, or an array has
@@ -140,15 +146,15 @@ def read_shot(
         shot = array_shot(stacked_array(shot), options, angles)
     elif not isinstance(shot, ExposureSet):
         paths = [shot] if isinstance(shot, str | os.PathLike) else list(shot)
-        found = find_shots(paths, options)
-        if len(found) != 1:
-            raise PolarguideError(
-                paths[0],
-                expected="one shot",
-                found=f"{len(found)}",
-                remedy="find_shots lists them; read them one by one.",
-            )
-        shot = found[0]
+        shots = find_shots(paths, options)
+        require(
+            len(shots) == 1,
+            paths[0],
+            expected="one shot",
+            found=f"{len(shots)}",
+            remedy="find_shots lists them; read them one by one.",
+        )
+        shot = shots[0]
     if shot.fault is not None:
         raise shot.fault
     options.require_kind(shot.kind, shot.name)
@@ -159,22 +165,24 @@ def read_shot(
 
 
 def fault_of(shot: ExposureSet, error: BaseException) -> PolarguideError:
-    """One of ``UNREADABLE`` as an error that names the shot."""
+    """Convert one of ``UNREADABLE`` to an error that names the shot."""
     if isinstance(error, PolarguideError):
         return error
+    found = "too little free memory"
+    remedy = "Free memory, or select a smaller region."
     if isinstance(error, OSError):
         found = error.strerror or str(error)
         remedy = "Check the files and their disk."
-    else:
-        found = "it needs more memory than there is"
-        remedy = "Free memory, or take a smaller region."
     return PolarguideError(
-        shot.where, expected="a shot that can be read, and room for its maps", found=found, remedy=remedy
+        shot.where,
+        expected="a readable shot, and memory and disk space for its maps",
+        found=found,
+        remedy=remedy,
     )
 
 
 def tiles(height: int, width: int) -> Iterator[slice]:
-    """Rows of a picture to work on at a time; each starts with a whole superpixel."""
+    """Split the rows of a picture into batches that start with a complete superpixel."""
     rows = max(1, _TILE // width // 4) * 4
     for top in range(0, height, rows):
         yield slice(top, min(top + rows, height))
@@ -182,15 +190,22 @@ def tiles(height: int, width: int) -> Iterator[slice]:
 
 @torch.no_grad()
 def maps_of(shot: ExposureSet, developed: Developed, options: ShotOptions) -> ShotMaps:
-    """The maps of developed intensities."""
+    """Compute the maps of developed intensities.
+
+    Args:
+        shot: name and files of the shot.
+        developed: its intensities.
+        options: options of reading.
+    """
     _, height, width, _ = developed.intensities.shape
     stokes = torch.empty((3, height, width))
-    dolp, debiased, aolp, sigma_dolp, sigma_aolp = (torch.empty((height, width)) for _ in range(5))
+    maps: dict[str, Any] = {
+        key: torch.empty((height, width))
+        for key in ("dolp", "dolp_debiased", "aolp", "sigma_dolp", "sigma_aolp")
+    }
     reason = torch.zeros((height, width), dtype=torch.uint8)
     factors = torch.from_numpy(np.ascontiguousarray(developed.factors))
     period = factors.shape[1]
-    floor = developed.noise.floor
-    slope = developed.noise.slope
     pattern: torch.Tensor | None = None
     for part in tiles(height, width):
         samples = torch.from_numpy(developed.intensities[:, part])
@@ -198,33 +213,28 @@ def maps_of(shot: ExposureSet, developed: Developed, options: ShotOptions) -> Sh
         count = gray.shape[1]
         if pattern is None:
             pattern = factors.repeat(1, -(-count // period), -(-width // period))[..., :width].contiguous()
-        variances = gray.clamp(min=0).mul_(slope).add_(floor).mul_(pattern[:, :count])
-        stokes[:, part] = s = optics.stokes(gray)
-        dolp[part] = degree = optics.dolp(s)
-        aolp[part] = optics.aolp(s)
+        variances = gray.clamp(min=0).mul_(developed.noise.slope).add_(developed.noise.floor)
+        variances.mul_(pattern[:, :count])
+        s = optics.stokes(gray)
+        degree = optics.dolp(s)
         spread = optics.polarization_uncertainty(s, variances)
-        sigma_dolp[part], sigma_aolp[part], debiased[part] = spread.dolp, spread.aolp, spread.debiased
-        # Later reasons replace earlier ones.
-        why = reason[part]
-        why[degree <= options.snr * spread.dolp] = Reason.NOISE
-        why[s[0] <= DARK_SNR / 2 * variances.sum(dim=0).sqrt()] = Reason.DARK
+        stokes[:, part] = s
+        values = (degree, spread.debiased, optics.aolp(s), spread.dolp, spread.aolp)
+        for tensor, value in zip(maps.values(), values, strict=True):
+            tensor[part] = value
+        # Later reasons replace earlier reasons.
+        reason[part][degree <= options.snr * spread.dolp] = Reason.NOISE
+        reason[part][s[0] <= DARK_SNR / 2 * variances.sum(dim=0).sqrt()] = Reason.DARK
     codes = reason.numpy()
-    for mask, kind in (
-        (developed.dark, Reason.DARK),
-        (developed.saturated, Reason.SATURATED),
-        (developed.masked, Reason.MASKED),
-    ):
-        codes[mask] = kind
+    codes[developed.dark] = Reason.DARK
+    codes[developed.saturated] = Reason.SATURATED
+    codes[developed.masked] = Reason.MASKED
     return ShotMaps(
         name=shot.name,
         files=shot.paths,
         intensities=developed.intensities,
         stokes=stokes.numpy(),
-        dolp=dolp.numpy(),
-        dolp_debiased=debiased.numpy(),
-        aolp=aolp.numpy(),
-        sigma_dolp=sigma_dolp.numpy(),
-        sigma_aolp=sigma_aolp.numpy(),
+        **{key: tensor.numpy() for key, tensor in maps.items()},
         reason=codes,
         noise=developed.noise,
         pair_ratio=developed.pair_ratio,
@@ -237,7 +247,7 @@ def maps_of(shot: ExposureSet, developed: Developed, options: ShotOptions) -> Sh
 
 
 TOWARD = (0.0, -0.5, -1.0)
-"""What a normal is guessed to be where polarization leaves a choice: toward the camera, and a little upward."""
+"""Prior direction of normals in camera axes: toward the camera, and a little upward."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -245,18 +255,18 @@ class SurfaceMaps:
     """Normals and layers of one shot, for a smooth dielectric under unpolarized light.
 
     Attributes:
-        zeniths: [3, H, W] float32, radians: of diffuse light, and of specular light below and above Brewster's angle,
-            whose degree of polarization is the pixel's. The six candidates of the normal have azimuth AoLP and AoLP +
-            pi (diffuse), AoLP + pi/2 and AoLP - pi/2 (specular). NaN for diffuse light where it cannot be so polarized.
-        normal: [H, W, 3] float32, the candidate nearest to ``TOWARD``, camera axes (x right, y down, z forward): a
-            guess among six, and 0 where the reason of the pixel says that it has no angle.
-        specular_paper, diffuse_paper: [H, W, C] float32, units of S0: the coarse cue of PolarGuide-GSDR, which needs no
-            normal (it takes the diffuse zenith of the DoLP); the two do not add up to S0.
-        specular_exact, diffuse_exact: [H, W, C] float32, units of S0: Fresnel's split, which needs the normal, and so
-            is as right as the guess above. They add up to S0.
-        conditioned: [H, W] bool, where the exact one is well conditioned.
+        zeniths: [3, H, W] float32, radians: zeniths with the DoLP of the pixel for diffuse light, and for specular
+            light below and above Brewster's angle. The six candidates of the normal have azimuth AoLP and AoLP + pi
+            (diffuse), AoLP + pi/2 and AoLP - pi/2 (specular). NaN for a DoLP that diffuse light cannot have.
+        normal: [H, W, 3] float32, the candidate nearest to ``TOWARD``, camera axes (x right, y down, z forward). This
+            choice is a guess. 0 for pixels without a valid angle.
+        specular_paper, diffuse_paper: [H, W, C] float32, units of S0: the coarse separation of PolarGuide-GSDR. It
+            needs no normal and uses the diffuse zenith of the DoLP. The layers do not add up to S0.
+        specular_exact, diffuse_exact: [H, W, C] float32, units of S0: separation by Fresnel's equations. It depends on
+            the guessed normal. The layers add up to S0.
+        conditioned: mask [H, W] of pixels at which the exact separation is well conditioned.
         refractive_index: refractive index of all surfaces.
-        perspective: whether the rays of the pixels are known; else all are parallel to the axis.
+        perspective: True if the rays of the pixels are known, False if they are assumed to be parallel to the axis.
     """
 
     zeniths: Map
@@ -271,13 +281,13 @@ class SurfaceMaps:
 
 
 def parse_intrinsics(text: str, size: tuple[int, int]) -> Camera:
-    """A camera of ``fx,fy,cx,cy`` in pixels of a picture of ``size`` (width, height).
+    """Parse ``fx,fy,cx,cy`` in pixels of a picture of ``size`` (width, height).
 
     Raises:
-        PolarguideError: the text is something else.
+        PolarguideError: the text is invalid.
     """
     numbers = decimals(text)
-    # A center may lie outside of a cut picture; beyond these bounds it is a slip.
+    # The center may be outside of a cropped picture. Beyond these bounds it is a typo.
     centered = all(abs(c - n / 2) <= 10 * n for c, n in zip(numbers[2:], size, strict=False))
     if len(numbers) != 4 or not centered or not all(0 < f <= 1e6 for f in numbers[:2]):
         raise PolarguideError(
@@ -290,10 +300,10 @@ def parse_intrinsics(text: str, size: tuple[int, int]) -> Camera:
 
 
 def camera_of(shot: ExposureSet, size: tuple[int, int], intrinsics: str | None) -> Camera | None:
-    """The camera of a shot: by intrinsics given, else of a scene that has poses, else None.
+    """Return the camera of a shot from intrinsics or from the poses of its scene; None without both.
 
     Raises:
-        PolarguideError: the intrinsics or the scene's model cannot be used.
+        PolarguideError: the intrinsics or the COLMAP model are invalid.
     """
     if intrinsics is not None:
         return parse_intrinsics(intrinsics, size)
@@ -309,12 +319,12 @@ def camera_of(shot: ExposureSet, size: tuple[int, int], intrinsics: str | None) 
 def surface_maps(
     maps: ShotMaps, camera: Camera | None = None, refractive_index: float | None = None
 ) -> SurfaceMaps:
-    """Candidates of the normals, one of them, and both separations.
+    """Compute the candidates of the normals, choose one of them, and separate both lobes.
 
     Args:
         maps: maps of the shot.
-        camera: of its pixels, for their rays; None takes rays parallel to the axis, which a long lens nearly has.
-        refractive_index: refractive index of all surfaces; None: ``INDEX``.
+        camera: camera of the pixels; None assumes rays parallel to the axis, as a long lens nearly has.
+        refractive_index: refractive index of all surfaces; None: the default index.
 
     Raises:
         PolarguideError: the refractive index is out of range.
@@ -323,45 +333,40 @@ def surface_maps(
     check_finite("refractive_index", refractive_index, 1.0001, 4.0)
     channels, height, width = maps.intensities.shape[3], *maps.reason.shape
     zeniths = torch.empty((3, height, width))
-    normal = torch.empty((3, height, width)).movedim(0, -1)
-    paper_specular, paper_diffuse, specular, diffuse = (
-        torch.empty((channels, height, width)).movedim(0, -1) for _ in range(4)
-    )
     conditioned = torch.empty((height, width), dtype=torch.bool)
+    names = ("specular_paper", "diffuse_paper", "specular_exact", "diffuse_exact")
+    depths = {"normal": 3, **{name: int(channels) for name in names}}
+    layers = {key: torch.empty((depth, height, width)).movedim(0, -1) for key, depth in depths.items()}
     stokes, dolp, aolp = (torch.from_numpy(a) for a in (maps.stokes, maps.dolp, maps.aolp))
     for part in tiles(height, width):
         rays = torch.tensor([0.0, 0.0, 1.0]) if camera is None else camera.rays()[part]
         s = optics.stokes(torch.from_numpy(maps.intensities[:, part]))
-        zenith, chosen = _chosen_normal(stokes[0, part], dolp[part], aolp[part], rays, refractive_index)
-        zeniths[:, part] = zenith
+        zenith, normal = _nearest_normal(stokes[0, part], dolp[part], aolp[part], rays, refractive_index)
         paper = optics.paper_separation(s, zenith[0], refractive_index)
-        exact = optics.exact_separation(s, chosen, rays, refractive_index)
-        paper_specular[part], paper_diffuse[part] = paper.specular, paper.diffuse
-        specular[part], diffuse[part] = exact.specular, exact.diffuse
+        exact = optics.exact_separation(s, normal, rays, refractive_index)
+        zeniths[:, part] = zenith
         conditioned[part] = exact.conditioned
-        normal[part] = chosen * torch.from_numpy(maps.usable[part])[..., None]
-    above = dolp > optics.diffuse_dolp_limit(refractive_index)
-    zeniths[0][above] = math.nan
+        normal = normal * torch.from_numpy(maps.usable[part])[..., None]
+        values = (normal, paper.specular, paper.diffuse, exact.specular, exact.diffuse)
+        for layer, value in zip(layers.values(), values, strict=True):
+            layer[part] = value
+    zeniths[0][dolp > optics.diffuse_dolp_limit(refractive_index)] = math.nan
     return SurfaceMaps(
         zeniths=zeniths.numpy(),
-        normal=normal.numpy(),
-        specular_paper=paper_specular.numpy(),
-        diffuse_paper=paper_diffuse.numpy(),
-        specular_exact=specular.numpy(),
-        diffuse_exact=diffuse.numpy(),
+        **{key: layer.numpy() for key, layer in layers.items()},
         conditioned=conditioned.numpy(),
         refractive_index=refractive_index,
         perspective=camera is not None,
     )
 
 
-def _chosen_normal(
+def _nearest_normal(
     s0: Tensor, dolp: Tensor, aolp: Tensor, rays: Tensor, index: float
 ) -> tuple[Tensor, Tensor]:
-    """Zeniths [3, ...] of the candidates, and the one of ``optics.physical_candidates`` nearest to ``TOWARD``.
+    """Return the zeniths [3, ...] of the candidates, and the candidate nearest to ``TOWARD``.
 
-    The same as ``optics.disambiguate`` finds, but without making all six: of two that lie half a turn apart the nearer
-    one is on the side of the guess.
+    The result is that of ``optics.disambiguate``, but only three of the six candidates are computed. The nearer one of
+    two candidates that are half a turn apart is on the side of the prior.
     """
     below, above = optics.specular_zeniths(dolp, index)
     zeniths = torch.stack((optics.diffuse_zenith(dolp, index), below, above))
@@ -372,7 +377,7 @@ def _chosen_normal(
     along = dot(rays, guess)
     cosine = torch.cos(aolp)
     sine = torch.sin(aolp)
-    # Across the ray, toward the guess: with azimuth AoLP, and a quarter turn from it.
+    # Components of the prior across the ray, at azimuth AoLP and a quarter turn from it.
     diffuse_side = cosine * right + sine * up
     specular_side = cosine * up - sine * right
     sines = torch.sin(zeniths)
@@ -393,46 +398,46 @@ def _chosen_normal(
     x = torch.where(specular, -sine, cosine) * sign
     y = torch.where(specular, cosine, sine) * sign
     axes = zip(*(v.unbind(-1) for v in (x_ref, up_ref, rays)), strict=True)
-    # Component by component in memory, as all that follows reads them.
+    # The layout in memory is by component, as later steps read it.
     return zeniths, torch.stack([x * a + y * b - cosine_z * ray for a, b, ray in axes]).movedim(0, -1)
 
 
 NAME = "array"
 """Default name of a shot in memory."""
-_MOSAIC = "a mosaic [H, W] of uint8 or uint16, as --sensor (ShotOptions.sensor) says"
 
 
 def array_shot(
     array: Array, options: ShotOptions, angles: Sequence[Angle] = ANGLES, name: str = NAME
 ) -> ExposureSet:
-    """A shot in memory.
+    """Create a shot in memory. The array is not modified.
 
     Args:
         array: with a sensor, a raw mosaic [H, W] of uint8 or uint16; else pictures through a filter, [K, H, W] gray or
-            [K, H, W, 3] RGB: uint8 or uint16 as stored, or linear floats from 0 to 1. It is not written to.
-        options: how it is read. name: name of the shot.
+            [K, H, W, 3] RGB: uint8 or uint16 as stored, or linear floats from 0 to 1.
+        options: options of reading.
         angles: angles of the K pictures in degrees, counter-clockwise as displayed.
+        name: name of the shot, which is the ``where`` of errors.
 
     Raises:
-        PolarguideError: shape, type or angles do not fit; its ``where`` is the name.
+        PolarguideError: shape, type or angles are invalid.
     """
     values = as_numpy(array)
     if options.sensor is not None:
         return ExposureSet(name, "mosaic", {}, stored=_mosaic(values, options, name))
-    if values.ndim == 2:
-        raise PolarguideError(
-            name,
-            expected="pictures [K, H, W] or [K, H, W, 3] through a filter, or a sensor of the mosaic",
-            found=kind_of(values),
-            remedy="Name the sensor of a mosaic: ShotOptions(sensor=...); stack the pictures of a filter, [K, H, W].",
-        )
-    if np.issubdtype(values.dtype, np.floating) and options.transfer == "srgb":
-        raise PolarguideError(
-            name,
-            expected="integers with srgb=True",
-            found=kind_of(values),
-            remedy="Leave srgb out: floats are linear.",
-        )
+    require(
+        values.ndim != 2,
+        name,
+        expected="pictures [K, H, W] or [K, H, W, 3] through a filter, or a sensor of the mosaic",
+        found=kind_of(values),
+        remedy="Name the sensor of a mosaic: ShotOptions(sensor=...); stack the pictures of a filter, [K, H, W].",
+    )
+    require(
+        not np.issubdtype(values.dtype, np.floating) or options.transfer != "srgb",
+        name,
+        expected="integers with srgb=True",
+        found=kind_of(values),
+        remedy="Leave srgb out: floats are linear.",
+    )
     stored = stored_pictures(values, name)
     exposures_of(angles, len(stored), f"{name} (angles)")
     known = [angle if isinstance(angle, str) else normalized(float(angle)) for angle in angles]
@@ -444,54 +449,59 @@ def array_shot(
 
 
 def is_array(shot: object) -> TypeGuard[Array | Sequence[Array]]:
-    """Whether something is an array, or a list of them."""
+    """Return True for an array or a list of arrays."""
     return isinstance(shot[0] if isinstance(shot, list | tuple) and shot else shot, np.ndarray | Tensor)
 
 
 def stacked_array(shot: Array | Sequence[Array], name: str = NAME) -> Array:
-    """The array itself, or one of a list of pictures.
+    """Stack a list of pictures to one array; return an array unchanged.
 
     Raises:
-        PolarguideError: the pictures of the list have several shapes or types.
+        PolarguideError: the pictures of the list differ in shape or type.
     """
     if not isinstance(shot, list | tuple):
         return shot  # type: ignore[return-value]
     pictures = [as_numpy(picture) for picture in shot]
     kinds = list(dict.fromkeys(map(kind_of, pictures)))
-    if len(kinds) > 1:
-        raise PolarguideError(
-            name,
-            expected="pictures of one shape and type",
-            found=" and ".join(kinds),
-            remedy="Export all pictures of a shot with the same settings.",
-        )
+    require(
+        len(kinds) <= 1,
+        name,
+        expected="pictures of one shape and type",
+        found=" and ".join(kinds),
+        remedy="Export all pictures of a shot with the same settings.",
+    )
     return np.stack(pictures)
 
 
 def _mosaic(values: NDArray[Any], options: ShotOptions, name: str) -> NDArray[Any]:
+    """Validate a raw mosaic in memory, and return it as [H, W].
+
+    Raises:
+        PolarguideError: shape or type are invalid.
+    """
     if values.ndim == 3 and values.shape[2] == 1:
         values = values[..., 0]
-    if values.ndim != 2 or values.dtype not in (np.uint8, np.uint16) or 0 in values.shape:
-        raise PolarguideError(
-            name,
-            expected=_MOSAIC,
-            found=kind_of(values),
-            remedy="Give what the sensor delivers, before any demosaicing; without a sensor, pictures [K, H, W].",
-        )
-    found = values.shape[1], values.shape[0]
-    wanted = options.width or found[0], options.height or found[1]
-    if found != wanted:
-        raise PolarguideError(
-            name,
-            expected=f"{wanted[0]}x{wanted[1]} pixels, as width and height say",
-            found=f"{found[0]}x{found[1]}",
-            remedy="Leave the two out: an array knows its size.",
-        )
+    require(
+        values.ndim == 2 and values.dtype in (np.uint8, np.uint16) and 0 not in values.shape,
+        name,
+        expected="a mosaic [H, W] of uint8 or uint16, as required by --sensor (ShotOptions.sensor)",
+        found=kind_of(values),
+        remedy="Give the values of the sensor before any demosaicing; without a sensor, pictures [K, H, W].",
+    )
+    height, width = values.shape
+    size = options.width or width, options.height or height
+    require(
+        size == (width, height),
+        name,
+        expected=f"{size[0]}x{size[1]} pixels according to width and height",
+        found=f"{width}x{height}",
+        remedy="Leave the two options out: an array has a size.",
+    )
     return np.ascontiguousarray(values)
 
 
 AROUND = 32
-"""Pixels around a part that are developed with it: more than any interpolation reaches."""
+"""Margin of a part in samples, larger than the reach of any interpolation."""
 
 
 _GAINS = {
@@ -499,9 +509,15 @@ _GAINS = {
     "corrected": "I0 + I90 is {:+.2%} off I45 + I135; corrected.",
     "left": "I0 + I90 is {:+.2%} off I45 + I135; not corrected (--gains auto does, a calibration does better).",
 }
+"""Notes on unequal pair sums."""
 
 
 def develop_mosaic(shot: ExposureSet, options: ShotOptions, part: Part | None) -> Developed:
+    """Develop a raw mosaic, or at least ``part`` of its picture. Levels and gains always refer to the whole mosaic.
+
+    Raises:
+        PolarguideError: the file or an option is invalid.
+    """
     files = MosaicFiles(options)
     stored = files.read(shot.where, shot.stored)
     pattern = files.pattern
@@ -524,12 +540,13 @@ def develop_mosaic(shot: ExposureSet, options: ShotOptions, part: Part | None) -
     step = DEMOSAIC_MODES[mode]
     x, y = files.corner
     cut = _cut(part, values.shape, step)
-    whole = (values.shape[1] // step, values.shape[0] // step) if cut is not None else None
-    if cut is not None:  # what is judged of the shot as a whole is judged
+    whole = None
+    if cut is not None:
+        whole = (values.shape[1] // step, values.shape[0] // step)
         values = np.ascontiguousarray(values[cut])
         dark = None if dark is None else dark[cut]
-        x = x + cut[1].start
-        y = y + cut[0].start
+        x += cut[1].start
+        y += cut[0].start
     saturated, black = unusable_samples(values, levels, dark)
     defective = defects([np.minimum(values, levels.white)], pattern.period)
     notes += [defects_note(int(defective.sum()), values.size)] if defective.any() else []
@@ -545,19 +562,17 @@ def develop_mosaic(shot: ExposureSet, options: ShotOptions, part: Part | None) -
         good = ~(bad[::2, ::2] | bad[1::2, ::2] | bad[::2, 1::2] | bad[1::2, 1::2])
         noise = estimated_noise([cells[angle] for angle in ANGLES], good, lsb)
     picture = demosaic(linear, saturated, pattern, mode=mode, interpolation=way, colored=False)
-    dark_pixels, masked = (
-        spoiled(samples, pattern, mode=mode, interpolation=way) for samples in (black, defective)
-    )
-    factors, averaged = interpolation_factors(options.sensor, x, y, mode)
-    turned = np.broadcast_to(factors.mean(axis=0), factors.shape)  # one that mixes all four angles
+    factors, mean_variance = interpolation_factors(options.sensor, x, y, mode)
+    # A rotation that is not a permutation mixes all four angles.
+    mixed = np.broadcast_to(factors.mean(axis=0), factors.shape)
     return Developed(
         intensities=oriented(picture.intensities, options.calibration),
-        dark=dark_pixels,
+        dark=spoiled(black, pattern, mode=mode, interpolation=way),
         saturated=picture.invalid,
-        masked=masked,
+        masked=spoiled(defective, pattern, mode=mode, interpolation=way),
         noise=noise,
-        factors=oriented(factors, options.calibration) if options.calibration.permutes else turned,
-        mean_variance=averaged,
+        factors=oriented(factors, options.calibration) if options.calibration.permutes else mixed,
+        mean_variance=mean_variance,
         pair_ratio=ratio,
         notes=(*notes, *gain_notes),
         origin=(0, 0) if cut is None else (cut[1].start // step, cut[0].start // step),
@@ -566,45 +581,54 @@ def develop_mosaic(shot: ExposureSet, options: ShotOptions, part: Part | None) -
 
 
 def _cut(part: Part | None, shape: tuple[int, ...], step: int) -> tuple[slice, slice] | None:
-    """The samples of a mosaic that a part of its picture needs: whole superpixels, with ``AROUND`` around them.
+    """Return the samples of a mosaic that a part of its picture needs: superpixels with a margin of ``AROUND``.
 
     Args:
-        part: part of the picture. shape: shape of the mosaic, rows and columns. step: samples of a pixel, each way.
+        part: part of the picture.
+        shape: shape of the mosaic, rows and columns.
+        step: samples per pixel, each way.
 
     Returns:
-        Rows and columns; None for all, where hardly any would be left out.
+        Rows and columns; None if the part is more than half of the mosaic.
     """
     if part is None:
         return None
     ends = []
-    for begin, length, most in ((part[1], part[3], shape[0]), (part[0], part[2], shape[1])):
+    for begin, length, size in ((part[1], part[3], shape[0]), (part[0], part[2], shape[1])):
         low = max(0, begin * step - AROUND) // 8 * 8
-        ends.append(slice(low, max(low, min(most, -(-((begin + length) * step + AROUND) // 8) * 8))))
+        ends.append(slice(low, max(low, min(size, -(-((begin + length) * step + AROUND) // 8) * 8))))
     rows, columns = ends
     area = (rows.stop - rows.start) * (columns.stop - columns.start)
     return (rows, columns) if 0 < 2 * area <= shape[0] * shape[1] else None
 
 
 _MAPS = 4 * (4 * 3 + 3 + 5)
-"""Bytes for each pixel of the intensities and of what is derived from them first, all at once."""
+"""Bytes per pixel of the intensities and the first maps."""
 
 
 def develop(shot: ExposureSet, options: ShotOptions, part: Part | None = None) -> Developed:
-    """Read the files of a shot; of a mosaic, develop at least ``part`` of the picture, None: all of it.
+    """Read and develop a shot at four angles.
+
+    Args:
+        shot: the shot.
+        options: options of reading.
+        part: part of the picture of a mosaic that is needed; None: all of it.
 
     Raises:
-        PolarguideError: one is missing, cannot be read, or does not fit the others or the options.
+        PolarguideError: a file is missing, cannot be read, or does not fit the others or the options.
     """
     if shot.kind == "mosaic":
         try:
             return develop_mosaic(shot, options, part)
         except PolarguideError as error:
-            path = shot.where
-            if error.where.startswith(str(path)):
+            if error.where.startswith(str(shot.where)):
                 raise
-            # An option or the dark frame does not fit this file; of many, it has to be named.
+            # An option or the dark frame does not fit this file, which the error has to name.
             raise PolarguideError(
-                f"{path} ({error.where})", expected=error.expected, found=error.found, remedy=error.remedy
+                f"{shot.where} ({error.where})",
+                expected=error.expected,
+                found=error.found,
+                remedy=error.remedy,
             ) from error
     if shot.kind == "filter":
         return _filter(shot, options)
@@ -621,7 +645,7 @@ def develop(shot: ExposureSet, options: ShotOptions, part: Part | None = None) -
 
 
 def set_samples(shot: ExposureSet, options: ShotOptions) -> SetSamples | None:
-    """Samples of a view at any polarizer angles; None for four angles or a mosaic, which ``develop`` reads.
+    """Read the samples of a shot at any polarizer angles; None for four angles or a mosaic, which ``develop`` reads.
 
     Raises:
         PolarguideError: a file is missing, cannot be read, or does not fit the others or the options.
@@ -637,10 +661,10 @@ def set_samples(shot: ExposureSet, options: ShotOptions) -> SetSamples | None:
 
 
 def check_files(options: ShotOptions) -> None:
-    """Check once, before many shots, the files that all of them are developed with.
+    """Validate the dark frame and the calibration before the first of many shots.
 
     Raises:
-        PolarguideError: there is none, or the calibration is damaged or of another sensor.
+        PolarguideError: a file is missing, or the calibration is damaged or of another sensor.
     """
     if options.dark_frame is not None:
         require_file(options.dark_frame, expected="a dark frame", remedy="Check --dark-frame.")
@@ -648,10 +672,10 @@ def check_files(options: ShotOptions) -> None:
 
 
 def _four(shot: ExposureSet, levels: Levels | None = None) -> Shots:
-    """The four pictures of a shot, of its files or in memory.
+    """Return the four pictures of a shot, from its files or from memory.
 
     Raises:
-        PolarguideError: a file cannot be read, or they differ in size, depth or orientation.
+        PolarguideError: a file cannot be read, or the pictures differ in size, depth or orientation.
     """
     if shot.stored is not None:
         return stacked(shot.stored, levels=levels)
@@ -665,6 +689,11 @@ def _four(shot: ExposureSet, levels: Levels | None = None) -> Shots:
 
 
 def _filter(shot: ExposureSet, options: ShotOptions) -> Developed:
+    """Develop four shots through a filter.
+
+    Raises:
+        PolarguideError: a file is missing, cannot be read, or does not fit the others or the options.
+    """
     if shot.stored is None:
         require_four_shots(shot.paths[0].parent, {shot.name: shot.files})
     paths = [shot.files[angle] for angle in ANGLES] if shot.stored is None else []
@@ -691,7 +720,7 @@ def _filter(shot: ExposureSet, options: ShotOptions) -> Developed:
     intensities = intensities / np.asarray(gains, np.float32)[:, None, None, None]
     lsb = 1 / float(levels.white)
     noise = given_noise(options, lsb)
-    # The luminance is the mean of three samples, whose noise is independent but in gray files, where they are copies.
+    # The luminance is the mean of three samples with independent noise, or of three copies in gray files.
     samples = 1 if (shots.pictures[..., :1] == shots.pictures).all() else 3
     factor = 1.0 if noise is None else 1 / samples
     noise = noise or estimated_noise(intensities.mean(axis=3), usable, lsb / samples**0.5)
@@ -713,7 +742,7 @@ def _filter(shot: ExposureSet, options: ShotOptions) -> Developed:
 
 
 def _read_view(shot: ExposureSet, options: ShotOptions) -> tuple[ViewData, int | None]:
-    """A view of a scene, and the stored value at which it saturates; None where it does not."""
+    """Read a view of a scene, and return it with the stored value at which it saturates, or None."""
     assert shot.root is not None
     layout = find_layout(shot.root)
     select_views(layout, [shot.view])
@@ -736,7 +765,15 @@ def _undistorted(
     lsb: float,
     options: ShotOptions,
 ) -> Developed:
-    """Return a picture of a scene, whose samples are its pixels."""
+    """Return the intensities of a view, whose samples are its pixels.
+
+    Args:
+        intensities: [4, H, W, C].
+        dark, saturated, invalid: masks [H, W].
+        foreground: mask [H, W] of the view, or None.
+        lsb: one stored value as a share of full scale.
+        options: options of reading.
+    """
     gray = intensities.mean(axis=3)
     good = ~(saturated | dark | invalid)
     return Developed(

@@ -1,4 +1,4 @@
-"""A printable scale of polarizer angles, to be put around a filter's ring and read from the front."""
+"""Printable scale of polarizer angles around the ring of a filter."""
 
 from __future__ import annotations
 
@@ -9,34 +9,36 @@ from jinja2 import Environment, PackageLoader
 BAND = 16.0
 """Width of the paper ring in mm."""
 MARGIN = 6.0
+"""Margin around the ring in mm."""
 LABELED = 15
 """Degrees between numbers."""
 SHORT = 5
 """Degrees between lines."""
 RULER = 50.0
+"""Length of the ruler in mm."""
 _FOOT = 22.0
 _SLIT = 277.5
 
 
 def ring_scale(diameter: float) -> str:
-    """An SVG picture, sized in millimeters: a paper ring with the angles of a filter inside it.
+    """Return an SVG picture of a paper ring with the angles of a filter, in millimeters.
 
-    Angles count counter-clockwise as seen from behind the camera, from its horizontal. Seen from the front, where one
-    reads the scale, they count clockwise, from the left; 0 and 180 are the same angle, so that the ring has each twice.
+    Seen from behind the camera, angles count counter-clockwise from its horizontal. The scale is read from the front,
+    where they count clockwise from the left. The period is 180 degrees, so each angle is on the ring twice.
 
     Args:
-        diameter: diameter of the hole, the outer diameter of the filter's turning ring, in mm.
+        diameter: diameter of the hole, the outer diameter of the filter's rotating ring, in mm.
     """
     inner = diameter / 2
     outer = inner + BAND
-    width = 2 * (outer + MARGIN)
-    middle = width / 2
+    middle = outer + MARGIN
+    width = 2 * middle
     marks = []
     for angle in range(0, 360, SHORT):
         label = None
         if angle % LABELED == 0:
             x, y = place(angle, middle, inner + 7.6)
-            # Digits stand on the ring, so that they are upright where one looks at them from outside it.
+            # Digits are upright as seen from outside of the ring.
             label = {"x": x, "y": y, "turn": angle - 90, "text": angle % 180}
         length = 3.0 if label is None else 5.0
         marks.append((place(angle, middle, inner), place(angle, middle, inner + length), label))
@@ -63,6 +65,6 @@ def ring_scale(diameter: float) -> str:
 
 
 def place(degrees: float, middle: float, radius: float) -> tuple[float, float]:
-    """Where an angle stands on the print: 0 at the left, 90 at the top, clockwise; x right, y down."""
+    """Return the position of an angle on the print, x right, y down: 0 at the left, 90 at the top, clockwise."""
     turn = math.radians(degrees)
     return middle - radius * math.cos(turn), middle - radius * math.sin(turn)

@@ -50,12 +50,17 @@ def read_set(name: str, pictures: Sequence[SetPicture], options: ShotOptions) ->
     """
     require_no_order(options.calibration, name)
     known = [picture for picture in pictures if not isinstance(picture.angle, str)]
-    kinds = ((kind_of_file(p.path) if p.frame is None else VIDEO, p.path) for p in known)
-    require_one(known[0].path.parent, kinds, "a set of one kind of file", COMPARABLE)
+    require_one(
+        known[0].path.parent,
+        ((kind_of_file(p.path) if p.frame is None else VIDEO, p.path) for p in known),
+        "a set of one kind of file",
+        COMPARABLE,
+    )
     stack = _stack(name, known[0].path, len(known), _read_each(known))
     gains, notes = _gains(known)
-    files = list(dict.fromkeys(picture.path for picture in known))
-    return _samples(stack, pictures, gains, notes, files, options)
+    return _samples(
+        stack, pictures, gains, notes, list(dict.fromkeys(picture.path for picture in known)), options
+    )
 
 
 def samples_of_arrays(
@@ -72,8 +77,14 @@ def samples_of_arrays(
     require_no_order(options.calibration, name)
     pictures = [SetPicture(Path(f"picture {k + 1}"), angle) for k, angle in enumerate(angles)]
     places = [k for k, angle in enumerate(angles) if not isinstance(angle, str)]
-    stack = _stack(name, Path(name), len(places), (stacked(stored[k : k + 1]) for k in places))
-    return _samples(stack, pictures, [1.0] * len(places), [], [], options)
+    return _samples(
+        _stack(name, Path(name), len(places), (stacked(stored[k : k + 1]) for k in places)),
+        pictures,
+        [1.0] * len(places),
+        [],
+        [],
+        options,
+    )
 
 
 def _stack(name: str, where: Path, count: int, pictures: Iterator[Shots]) -> tuple[Shots, np.dtype[Any]]:
@@ -94,8 +105,12 @@ def _stack(name: str, where: Path, count: int, pictures: Iterator[Shots]) -> tup
     first = next(pictures)
     colors = 1 if _is_gray(first) else 3
     needed = (count * (2 * colors + 1) + _FITTED) * first.dark.size
-    remedy = "Make the pictures smaller, all by the same factor."
-    require_memory(where, needed, f"{count} pictures of {name}", remedy=remedy)
+    require_memory(
+        where,
+        needed,
+        f"{count} pictures of {name}",
+        remedy="Make the pictures smaller, all by the same factor.",
+    )
     values = np.empty((count, *first.dark.shape, colors), np.uint16)
     lost = np.empty(values.shape[:3], bool)
     dark = np.ones(values.shape[1:3], bool)
@@ -179,7 +194,7 @@ def _subset(read: Shots, codes: NDArray[Any]) -> Shots:
 
 
 def require_no_order(calibration: Calibration, name: str) -> None:
-    """Check that a calibration has neither gains nor an order, which apply to 0, 45, 90 and 135 degrees only.
+    """Check that a calibration has no gains and no order, which apply to 0, 45, 90 and 135 degrees only.
 
     Raises:
         PolarguideError: the calibration has gains or an order.

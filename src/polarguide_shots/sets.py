@@ -230,8 +230,16 @@ def _named_set(folder: Path, view: str, pictures: Sequence[SetPicture]) -> Expos
     for picture in pictures:
         earlier = first.setdefault(picture.angle, picture.path)
         if earlier is not picture.path:
-            expected = f"one picture of {view} at {angle_text(picture.angle)} degrees"
-            return _exposure_set(view, pictures, fault=ambiguous(folder, expected, earlier, picture.path))
+            return _exposure_set(
+                view,
+                pictures,
+                fault=ambiguous(
+                    folder,
+                    f"one picture of {view} at {angle_text(picture.angle)} degrees",
+                    earlier,
+                    picture.path,
+                ),
+            )
     return _exposure_set(view, pictures)
 
 
@@ -305,8 +313,13 @@ def read_frame_table(path: Path, video: Path) -> list[tuple[int, Angle]]:
     Raises:
         PolarguideError: the table is missing, a cell is invalid, or a frame is repeated.
     """
-    table = f"a table frame,angle of {video.name}"
-    require(path.is_file(), path, expected=table, found="no such file", remedy=_REMEDY)
+    require(
+        path.is_file(),
+        path,
+        expected=f"a table frame,angle of {video.name}",
+        found="no such file",
+        remedy=_REMEDY,
+    )
     rows = read_rows(path, _REMEDY)
     header = ",".join(rows[0][1]).lower() if rows else ""
     require(

@@ -1,4 +1,4 @@
-"""Verbs of shots without poses and of the camera: measure, priors, calibrate, scale."""
+"""The verbs measure, priors, calibrate and scale."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import tyro
 
 import polarguide
 from polarguide.cli.console import ConsoleReporter, console, print_error, say, set_threads
-from polarguide.core.errors import PolarguideError
+from polarguide.core.errors import PolarguideError, require
 from polarguide.core.files import make_folder, read_file, write_whole
 from polarguide.core.options import Memory, SceneOptions, ThreadOptions, check_finite
 from polarguide.core.records import option_name
@@ -36,32 +36,32 @@ def measure(
     angles: Annotated[CalibrationOptions, tyro.conf.arg(name="")],
     compute: Annotated[ThreadOptions, tyro.conf.arg(name="")],
 ) -> int:
-    """A table of many shots for inspection lines: S0, DoLP and AoLP by region, limits, a golden part.
+    """Measure many shots for inspection lines: S0, DoLP and AoLP by region, limits, a golden part.
 
     Writes table.csv (a line per region), table.jsonl (a line per shot), and pictures of shots beyond their limits.
-    The same command goes on where it stopped: what is in the table is not measured again. The exit status is 3 if a
-    shot is beyond a limit, else 2 if one could not be read. docs/how-to/inspection-line.md shows the whole way.
+    Repeat the command to resume: shots in the table are not measured again. The exit status is 3 if a shot is beyond a
+    limit, else 2 if a shot could not be read. docs/how-to/inspection-line.md has a complete example.
 
     Args:
         paths: Raw mosaics, shots of four files, scenes, or folders of them.
         out: Folder of the table.
     """
     set_threads(compute.threads)
-    if bool(paths) == (watching.watch is not None):
-        raise PolarguideError(
-            "--watch",
-            expected="shots to measure, or a folder to watch",
-            found="both" if paths else "neither",
-            remedy="Give files and folders for one pass, or --watch FOLDER.",
-        )
+    require(
+        bool(paths) == (watching.watch is None),
+        "--watch",
+        expected="shots to measure, or a folder to watch",
+        found="both" if paths else "neither",
+        remedy="Give files and folders for one pass, or --watch FOLDER.",
+    )
     for name in ("settle", "patience", "idle"):
-        if watching.watch is None and getattr(watching, name) != getattr(WatchOptions, name):
-            raise PolarguideError(
-                f"--{name}",
-                expected="--watch",
-                found="one pass over files",
-                remedy="Leave it out, or watch a folder.",
-            )
+        require(
+            watching.watch is not None or getattr(watching, name) == getattr(WatchOptions, name),
+            f"--{name}",
+            expected="--watch",
+            found="one pass over files",
+            remedy="Leave it out, or watch a folder.",
+        )
     reading = replace(reading, calibration=angles.read(), analyzers=angles.analyzers())
     heard = partial(_print_entry, every=watching.watch is not None)
     if watching.watch is None:
@@ -75,23 +75,22 @@ def measure(
                 should_stop=should_stop, heard=heard, reporter=ConsoleReporter(),
             )  # fmt: skip
     _print_outcome(outcome)
-    if outcome.trouble:  # why nothing was found in a watched folder
+    if outcome.trouble:
         print_error(outcome.trouble)
     if outcome.waiting:
         names = ", ".join(outcome.waiting[:4]) + (", ..." if len(outcome.waiting) > 4 else "")
         error = PolarguideError(
             watching.watch,
             expected="complete shots",
-            found=f"{len(outcome.waiting)} that are not, and were not measured ({names})",
-            remedy="Complete, rename or remove their files; the same command goes on.",
+            found=f"{len(outcome.waiting)} incomplete shots, which were not measured ({names})",
+            remedy="Complete, rename or remove their files, and repeat the command.",
         )
         print_error(str(error))
-    status: int = outcome.exit_status
-    return status
+    return int(outcome.exit_status)
 
 
 def _print_entry(entry: Any, *, every: bool) -> None:
-    """Print a shot that is beyond a limit or could not be read; ``every``: also one without a fault."""
+    """Print a shot that is beyond a limit or could not be read; with ``every``, any shot."""
     if entry.status == "unread":
         print_error(entry.why)
     elif entry.status == "beyond":
@@ -132,35 +131,34 @@ def run_priors(
     angles: Annotated[CalibrationOptions, tyro.conf.arg(name="")],
     machine: Annotated[ThreadOptions, tyro.conf.arg(name="")],
 ) -> None:
-    """Polarization maps of a shot, many shots or a scene: pictures, numbers and a page.
+    """Write polarization maps of a shot, many shots or a scene: pictures, numbers and a page.
 
-    S0, DoLP and AoLP with their standard deviations, both separations, polarization normals with the zeniths of their
-    candidates, and the pixels that say nothing. A shot is a raw mosaic (with --sensor), four files of a rotating filter
-    (names or folders with 0, 45, 90, 135), or a view of a scene without poses; folders may hold many. The exact
-    separation needs normals: those of a trained run with --run, else the polarization normals themselves, with their
-    ambiguity resolved only by the surface facing the camera (a rough guess, and named so). docs/how-to/one-shot.md
-    says more.
+    The maps are S0, DoLP and AoLP with their standard deviations, both separations, polarization normals with the
+    zeniths of their candidates, and the reasons against pixels. A shot is a raw mosaic (with --sensor), four files of a
+    rotating filter (names or folders with 0, 45, 90, 135), or a view of a scene without poses. A folder may contain
+    many shots. The exact separation needs normals. With --run these are the normals of a trained run. Otherwise they
+    are polarization normals, whose ambiguity is resolved by the candidate that faces the camera (a rough guess).
+    docs/how-to/one-shot.md has more information.
 
     Args:
         paths: Mosaics, shots, folders of them, or a scene folder.
-        out: Folder to write: a folder for each shot in it; pictures and a contact sheet for a scene with poses.
-        formats: Of the maps: some of png,exr,npy,page. Without it all for shots, none for a scene with poses.
-        intrinsics: fx,fy,cx,cy of the developed pictures, for normals; without them the rays are taken to be parallel.
-        refractive_index: Of the surfaces; without it as scene.json says, else 1.5.
+        out: Folder to write: a folder for each shot, or pictures and a contact sheet for a scene with poses.
+        formats: Formats of the maps: some of png,exr,npy,page. Default: all for shots, none for a scene with poses.
+        intrinsics: fx,fy,cx,cy of the developed pictures, for normals; default: parallel rays.
+        refractive_index: Refractive index of the surfaces; default: the value in scene.json, else 1.5.
         run: For a scene: a run trained on it (at the same --downscale), whose normals resolve the ambiguity.
         views: For a scene: test, train, all, or names separated by commas.
-        threshold: For a scene: DoLP above which a pixel's normal is used; without it 0.05.
+        threshold: For a scene: DoLP above which a pixel's normal is used; default: 0.05.
         downscale: For a scene: average the pictures over boxes of this many pixels first.
-        memory: For a scene: GiB that the pictures may take; without it, 80 % of what is free.
+        memory: For a scene: memory of the pictures in GiB; default: 80 % of the free memory.
     """
     set_threads(machine.threads)
     reporter = ConsoleReporter()
-    if not paths:
-        raise PolarguideError(
-            "PATH", expected="at least one shot or scene", found="none", remedy="Name files or folders."
-        )
+    require(
+        paths, "PATH", expected="at least one shot or scene", found="none", remedy="Name files or folders."
+    )
     options = replace(shots, calibration=angles.read(), analyzers=angles.analyzers())
-    some = None if formats is None else [name.strip() for name in formats.split(",") if name.strip()]
+    names = None if formats is None else [name.strip() for name in formats.split(",") if name.strip()]
     if len(paths) == 1 and os.path.lexists(paths[0] / "sparse"):
         _refuse("shots", "a scene with poses", intrinsics=intrinsics)
         sheet = polarguide.priors(
@@ -170,7 +168,7 @@ def run_priors(
             views=views,
             threshold=0.05 if threshold is None else threshold,
             reading=SceneOptions(downscale, "srgb" if shots.transfer == "srgb" else "linear", memory),
-            formats=some or (),
+            formats=names or (),
             shots=replace(options, transfer="auto"),
             refractive_index=refractive_index,
             reporter=reporter,
@@ -185,15 +183,15 @@ def run_priors(
         threshold=threshold,
         memory=memory,
     )
-    if downscale != 1:
-        raise PolarguideError(
-            "downscale", expected="1 for shots", found=str(downscale), remedy="Use --demosaic quarter."
-        )
+    found = str(downscale)
+    require(
+        downscale == 1, "downscale", expected="1 for shots", found=found, remedy="Use --demosaic quarter."
+    )
     outcome = polarguide.shot_priors(
         paths,
         out,
         shots=options,
-        formats=some,
+        formats=names,
         intrinsics=intrinsics,
         refractive_index=refractive_index,
         reporter=reporter,
@@ -203,23 +201,24 @@ def run_priors(
         say(f"{name}: {page if page.exists() else folder}")
     if len(outcome.folders) > 4:
         say(f"... and {len(outcome.folders) - 4} more in {out}")
-    if outcome.faults:
-        total = len(outcome.faults) + len(outcome.folders)
-        raise PolarguideError(
-            out,
-            expected=f"{total} shots",
-            found=f"{len(outcome.faults)} that failed ({', '.join(list(outcome.faults)[:4])})",
-            remedy="The warnings above say why; the others are written.",
-        )
+    require(
+        not outcome.faults,
+        out,
+        expected=f"{len(outcome.faults) + len(outcome.folders)} shots",
+        found=f"{len(outcome.faults)} failed shots ({', '.join(list(outcome.faults)[:4])})",
+        remedy="See the warnings above; the other shots are written.",
+    )
 
 
 def _refuse(expected: str, found: str, **options: object) -> None:
-    """Refuse options that are given and mean something for others alone."""
+    """Check that options are not given which apply to ``expected`` only.
+
+    Raises:
+        PolarguideError: an option is given.
+    """
     for name, value in options.items():
-        if value is not None:
-            raise PolarguideError(
-                option_name(name), expected=expected, found=found, remedy=f"Leave it out, or name {expected}."
-            )
+        remedy = f"Leave it out, or name {expected}."
+        require(value is None, option_name(name), expected=expected, found=found, remedy=remedy)
 
 
 def calibrate(
@@ -230,14 +229,14 @@ def calibrate(
     settings: Annotated[CalibrateSettings, tyro.conf.arg(name="")],
     compute: Annotated[ThreadOptions, tyro.conf.arg(name="")],
 ) -> None:
-    """Calibrate a polarization camera: what each of its polarizers really measures, from shots of one before the lens.
+    """Calibrate the polarizers of a polarization camera, from shots of a polarizer in front of the lens.
 
-    The file corrects extinction ratio, angle and throughput of every position; prepare, priors, measure and inspect
-    take it as --calibration. docs/how-to/calibrate.md says how to take the shots.
+    The file corrects extinction ratio, angle and throughput of every position. It is the option --calibration of
+    prepare, priors, measure and inspect. docs/how-to/calibrate.md describes the shots.
 
     Args:
-        shots: Folder of raw mosaics of a linear polarizer before a uniform light, at five or more angles.
-        out: File to write, ending in .safetensors; a picture (PNG) of the same name goes beside it.
+        shots: Folder of raw mosaics of a linear polarizer in front of a uniform light, at five or more angles.
+        out: File to write, ending in .safetensors; a picture (PNG) of the same name is written next to it.
     """
     set_threads(compute.threads)
     calibration = importlib.import_module("polarguide_shots.calibration.calibrate")
@@ -250,20 +249,20 @@ def calibrate(
 def scale(*, diameter: float, out: Path = Path("filter-scale.svg")) -> None:
     """Print a scale of angles for the ring of a polarizing filter: an SVG file in exact millimeters.
 
-    The paper ring is fixed to the lens around the filter's turning ring and read from the front, where angles count
-    clockwise: as prepare reads them, they count counter-clockwise from behind the camera. docs/how-to/capture.md says
-    how to use it.
+    Fix the paper ring to the lens around the rotating ring of the filter, and read it from the front. Seen from the
+    front, angles count clockwise. From behind the camera they count counter-clockwise, as prepare reads them.
+    docs/how-to/capture.md describes its use.
 
     Args:
-        diameter: Outer diameter of the filter's turning ring in mm: measure it (a 67 mm filter has about 70).
+        diameter: Outer diameter of the rotating ring of the filter in mm. A 67 mm filter has about 70; measure it.
         out: SVG file to write.
     """
     check_finite("diameter", diameter, 20.0, 160.0)
     data = ring_scale(diameter).encode()
-    if out.exists() and (out.is_dir() or read_file(out) != data):
-        raise PolarguideError(
-            out, expected="a new file", found="a file with other contents", remedy="Give another --out."
-        )
+    same = not out.exists() or (out.is_file() and read_file(out) == data)
+    require(
+        same, out, expected="a new file", found="a file with other contents", remedy="Give another --out."
+    )
     make_folder(out.parent)
     write_whole(out, data)
     console.print(f"scale: {out} (print at 100 %, and measure the 50 mm line)", markup=False)

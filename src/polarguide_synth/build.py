@@ -361,7 +361,7 @@ def build_scene(spec: SceneSpec, folder: Path, variant: Variant) -> BuiltScene:
     write_whole(folder / "environment.hdr", encoded.tobytes())
     textures = [_texture(thing, mesh, spec.folder) for thing, mesh in zip(spec.things, meshes, strict=True)]
     contents: list[dict[str, Any]] = []
-    for channel in range(3) if variant.channels == 3 else (None,):
+    for channel in range(3) if variant.color == "rgb" else (None,):
         content: dict[str, Any] = {"type": "scene", "sky": environment_dict(panorama, channel)}
         for number, thing in enumerate(spec.things):
             place = folder / "mesh" / f"{thing.name}.ply"
@@ -386,8 +386,9 @@ def _mesh(thing: Thing, spec: SceneSpec) -> Mesh:
     if thing.shape.get("type") == "ball":
         mesh = sphere(decode(thing.shape, Ball, f"{thing.name} shape", remedy=REMEDY).radius)
     elif thing.shape.get("type") == "mesh":
-        file = decode(thing.shape, MeshFile, f"{thing.name} shape", remedy=REMEDY).file
-        mesh = _user_mesh(spec.folder / file)
+        mesh = _user_mesh(
+            spec.folder / decode(thing.shape, MeshFile, f"{thing.name} shape", remedy=REMEDY).file
+        )
     else:
         mesh = make_mesh(thing.shape, thing.name)
     moved = mesh.moved(thing.scale, rotation(thing.rotation), np.array(thing.position, float))

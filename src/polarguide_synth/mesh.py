@@ -142,8 +142,7 @@ def primitive_distance(points: Array, part: dict[str, Any]) -> Array:
     if kind == "ellipsoid":
         size = np.array(part["size"], float)
         near = np.linalg.norm(local / size, axis=-1)
-        slope = np.linalg.norm(local / size**2, axis=-1)
-        return np.asarray(near * (near - 1) / np.maximum(slope, 1e-9))
+        return np.asarray(near * (near - 1) / np.maximum(np.linalg.norm(local / size**2, axis=-1), 1e-9))
     if kind == "box":
         return _rounded_box(np.abs(local) - np.array(part["size"], float), part.get("round", 0.0))
     if kind == "ring":
@@ -334,7 +333,6 @@ def _combined(points: Array, parts: list[dict[str, Any]], blend: float) -> Array
 
 
 def _smooth_minimum(a: Array, b: Array, width: float) -> Array:
-    """Compute the polynomial smooth minimum with a transition of ``width``."""
     if width <= 0:
         return np.minimum(a, b)
     overlap = np.maximum(width - np.abs(a - b), 0) / width

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from polarguide.capture.sensor.pattern import SENSORS
-from polarguide.capture.write import write_png, write_view
+from polarguide.capture.write import write_png_file, write_view
 from polarguide.core.errors import require
 from polarguide.core.progress import Reporter
 from polarguide.core.text import decimals
@@ -196,8 +196,15 @@ def synthesize(
     job = Job(spec, settings, out, built, cameras, exposure, Sensor())
     _render_all(job, reporter)
     write_sparse(built, cameras, names, plan.tests, out, settings)
-    clipped = folder.clipped_share(out, names)
-    record = scene_record(spec, settings, variant, names, plan.tests, exposure=exposure, clipped=clipped)
+    record = scene_record(
+        spec,
+        settings,
+        variant,
+        names,
+        plan.tests,
+        exposure=exposure,
+        clipped=folder.clipped_share(out, names),
+    )
     if job.mosaics:
         gains = {str(45 * k): gain for k, gain in enumerate(job.sensor.gains)}
         folder.write_file(out / "calibration.json", json.dumps({"gains": gains}).encode())
@@ -240,7 +247,7 @@ def render_view(job: Job, number: int) -> None:
     random = np.random.default_rng((settings.seed, 31, number))
     if job.mosaics:
         raw = mosaic(light.stokes * job.exposure, settings.sensor, settings.noise, random, job.sensor)
-        write_png(job.out / "raw" / f"{name}.png", raw)
+        write_png_file(job.out / "raw" / f"{name}.png", raw)
         light = LobeRadiance(_halved(light.specular), _halved(light.diffuse), _halved(light.emitted))
     stokes = light.stokes * job.exposure
     if job.has_ground_truth(name):
@@ -254,12 +261,17 @@ def render_view(job: Job, number: int) -> None:
     photograph = job.photograph(number)
     if photograph is not None:
         shot, path = photograph
-        rays = camera.rays(dtype=torch.float64).numpy()
-        folder.write_file(path, filter_jpeg(stokes, rays, shot, settings.noise, random, job.sensor))
+        folder.write_file(
+            path,
+            filter_jpeg(
+                stokes, camera.rays(dtype=torch.float64).numpy(), shot, settings.noise, random, job.sensor
+            ),
+        )
     # The files of a simulated sensor have the noise. These pictures are their noise-free reference.
     noise = settings.noise if settings.sensor == "ideal" else 0.0
-    codes = folder.sensor_codes(stokes, lambda values: noisy(values, noise, random, job.sensor))
-    write_view(job.out, name, codes)
+    write_view(
+        job.out, name, folder.sensor_codes(stokes, lambda values: noisy(values, noise, random, job.sensor))
+    )
 
 
 def write_sparse(
@@ -279,8 +291,9 @@ def write_sparse(
         out: scene folder.
         settings: number and seed of the points.
     """
-    pictures = [folder.photograph(out, name) for name in names]
-    sparse = sample_sparse_points(built, cameras, pictures, settings.points, settings.seed)
+    sparse = sample_sparse_points(
+        built, cameras, [folder.photograph(out, name) for name in names], settings.points, settings.seed
+    )
     write_model(out / "sparse" / "0", cameras, names, sparse)
     folder.write_file(out / "split.json", json.dumps({"test": tests}).encode())
 
@@ -291,8 +304,7 @@ def _metered_exposure(built: BuiltScene, cameras: list[Camera], seed: int) -> fl
     for camera in cameras[:: -(-len(cameras) // METER_VIEWS)]:
         factor = max(1, camera.width // METER_WIDTH)
         limits = PathLimits(built.spec.depth, visible_only=built.spec.object_only)
-        small = camera.downscaled(factor)
-        light = render_lobes(built.scenes, small, METER_SAMPLES, seed=seed, limits=limits)
+        light = render_lobes(built.scenes, camera.downscaled(factor), METER_SAMPLES, seed=seed, limits=limits)
         values.append(light.stokes[0].ravel())
     return float(f"{BRIGHT / max(float(np.percentile(np.concatenate(values), 99)), 1e-9):.4g}")
 
@@ -300,8 +312,7 @@ def _metered_exposure(built: BuiltScene, cameras: list[Camera], seed: int) -> fl
 def _halved(values: Array) -> Array:
     """Average boxes of 2x2 pixels: [..., 2H, 2W, 3] to [..., H, W, 3]."""
     *lead, height, width, colors = values.shape
-    boxes = values.reshape(*lead, height // 2, 2, width // 2, 2, colors)
-    return np.asarray(boxes.mean(axis=(-4, -2)))
+    return np.asarray(values.reshape(*lead, height // 2, 2, width // 2, 2, colors).mean(axis=(-4, -2)))
 
 
 PARAMETERS = ("views", "noise", "roughness", "index", "spacing")

@@ -135,8 +135,11 @@ class FilterShot:
 def plan_shot(seed: int, number: int) -> FilterShot:
     """Return the angle, exposure and orientation of the photograph of view ``number``."""
     random = np.random.default_rng((seed, 47, number))
-    angle = STEP * int(random.integers(0, 180 // STEP))
-    return FilterShot(angle, float(random.uniform(-STOPS, STOPS)), int(random.choice(_TURNS)))
+    return FilterShot(
+        STEP * int(random.integers(0, 180 // STEP)),
+        float(random.uniform(-STOPS, STOPS)),
+        int(random.choice(_TURNS)),
+    )
 
 
 def behind_filter(stokes: Array, rays: Array, degrees: float) -> Array:
@@ -174,10 +177,12 @@ def filter_jpeg(
     light = behind_filter(stokes, rays, shot.angle) * 2.0**shot.stops
     encoded = srgb_encode_array(np.clip(noisy(light, noise, random, sensor), 0.0, 1.0))
     stored = apply_orientation(np.rint(255 * encoded).astype(np.uint8), INVERSE[shot.orientation])
-    bgr = np.ascontiguousarray(stored[..., ::-1])
-    _, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
-    time = _TIME * Fraction(2.0**shot.stops) if shot.noted else None
-    block = b"Exif\0\0" + exif_tags(shot.orientation, time)
+    _, data = cv2.imencode(
+        ".jpg", np.ascontiguousarray(stored[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, QUALITY]
+    )
+    block = b"Exif\0\0" + exif_tags(
+        shot.orientation, _TIME * Fraction(2.0**shot.stops) if shot.noted else None
+    )
     segment = b"\xff\xe1" + struct.pack(">H", len(block) + 2) + block
     return data[:2].tobytes() + segment + data[2:].tobytes()
 
@@ -299,8 +304,7 @@ def _sums(
     index = dr.arange(mi.UInt32, pixels * count)
     pixel = index // per_pixel
     sample = index - pixel * per_pixel + first
-    parts = _path(scene, lens, pixel, sample, seed, limits, center)
-    flat = [value for color in parts for value in color]
+    flat = [value for color in _path(scene, lens, pixel, sample, seed, limits, center) for value in color]
     dr.eval(flat)
     return [dr.block_reduce(dr.ReduceOp.Add, value, count) for value in flat]
 

@@ -61,11 +61,6 @@ class Variant:
     paths_per_second: float
     note: str = ""
 
-    @property
-    def channels(self) -> int:
-        """Number of renderings per picture."""
-        return 3 if self.color == "rgb" else 1
-
 
 def choose_variant(color: Color = "rgb", *, threads: int = 0) -> Variant:
     """Select a polarized variant: a compiled variant if the LLVM library can be loaded, else the scalar variant.

@@ -166,8 +166,7 @@ def printed(
     picture[block] = (sky * (0.5 + tone))[block]
     for _ in range(9):
         center = random.uniform((0.15, 0.15), (0.85, 0.53))
-        radius = random.uniform(0.03, 0.13)
-        disc = (np.hypot(u - center[0], v - center[1]) < radius) & block
+        disc = (np.hypot(u - center[0], v - center[1]) < random.uniform(0.03, 0.13)) & block
         picture[disc] = random.uniform(0.03, 0.75, 3)
     for line in range(7):
         top = 0.63 + 0.045 * line
@@ -219,9 +218,12 @@ def make_texture(data: dict[str, Any], where: str, folder: Path) -> Array:
     Raises:
         PolarguideError: the type, a field or a value is invalid.
     """
-    makers: dict[str, Callable[..., Array]] = {**TEXTURES, "image": functools.partial(image, folder=folder)}
-    expected = f'a color, "own", or a texture with type {", ".join(TEXTURES)}'
-    return make(makers, data, f"{where} material.color", expected)
+    return make(
+        {**TEXTURES, "image": functools.partial(image, folder=folder)},
+        data,
+        f"{where} material.color",
+        f'a color, "own", or a texture with type {", ".join(TEXTURES)}',
+    )
 
 
 def _grid(pixels: int) -> tuple[Array, Array]:
@@ -355,8 +357,7 @@ def _furniture(picture: Array, sides: dict[str, NDArray[np.bool_]], u: Array, z:
         at = -1.6
         while at < 1.55:
             thick = random.uniform(0.03, 0.09)
-            tall = random.uniform(0.22, 0.34)
-            book = west & (u > at) & (u < at + thick) & (z > foot) & (z < foot + tall)
+            book = west & (u > at) & (u < at + thick) & (z > foot) & (z < foot + random.uniform(0.22, 0.34))
             picture[book] = random.uniform(0.03, 0.5, 3)
             at += thick + (0.004 if random.random() < 0.9 else 0.2)
     south = sides["south"]
@@ -415,9 +416,9 @@ def make_environment(data: dict[str, Any], where: str, folder: Path) -> Array:
     Raises:
         PolarguideError: the type, a field or a value is invalid.
     """
-    makers: dict[str, Callable[..., Array]] = {
-        **ENVIRONMENTS,
-        "image": functools.partial(image, folder=folder),
-    }
-    expected = f"a type of {', '.join(ENVIRONMENTS)} with its fields"
-    return make(makers, data, f"{where} (environment)", expected)
+    return make(
+        {**ENVIRONMENTS, "image": functools.partial(image, folder=folder)},
+        data,
+        f"{where} (environment)",
+        f"a type of {', '.join(ENVIRONMENTS)} with its fields",
+    )

@@ -102,8 +102,7 @@ class Sampler:
         self._sample = sample
         self._seed = seed
         self._used = 0
-        state = mi.sample_tea_64(pixel, seed)
-        self.later = mi.PCG32(1, state + mi.UInt64(sample), mi.UInt64(sample))
+        self.later = mi.PCG32(1, mi.sample_tea_64(pixel, seed) + mi.UInt64(sample), mi.UInt64(sample))
 
     def next(self) -> Any:
         """Return the next dimension of the sequence, in [0, 1)."""
@@ -154,8 +153,9 @@ def sample_cosine(
     wo = mi.Vector3f(wo.x, wo.y, wo.z * side)
     density = dr.abs(wo.z) * dr.inv_pi
     active = active & (density > LEAST_DENSITY)
-    inverse = dr.select(active, 1 / dr.maximum(density, LEAST_DENSITY), 0.0)
-    weight = bsdf.eval(context, si, wo, active) * inverse
+    weight = bsdf.eval(context, si, wo, active) * dr.select(
+        active, 1 / dr.maximum(density, LEAST_DENSITY), 0.0
+    )
     return (value, toward_density), (wo, dr.select(active, density, 0.0), weight, mi.Bool(False))
 
 
@@ -288,8 +288,14 @@ def _scatter(
         [S0, S1, S2] at the camera, and (active, ray, gain, place, density, delta) of the ray that leaves.
     """
     if active is False:  # the scalar variant: there is no surface
-        dark = [mi.UnpolarizedSpectrum(0.0)] * 3
-        return dark, (False, mi.Ray3f(ray), gain, mi.Interaction3f(si), 0.0, False)
+        return [mi.UnpolarizedSpectrum(0.0)] * 3, (
+            False,
+            mi.Ray3f(ray),
+            gain,
+            mi.Interaction3f(si),
+            0.0,
+            False,
+        )
     choose, turn, light = numbers
     bsdf = si.bsdf(ray)
     ds, brought = scene.sample_emitter_direction(si, light, True, active)

@@ -21,13 +21,13 @@ from polarguide_bench.join import join_tables
 from polarguide_bench.options import BENCH, Bench, BenchOptions
 from polarguide_synth import render as renderer
 from polarguide_synth.folder import scene_digest
-from polarguide_synth.settings import PRESETS, SynthSettings, find_scene
+from polarguide_synth.settings import PRESETS, Overrides, SynthSettings, find_scene
 
 RENDER = BenchOptions(render_only=True, jobs=1)
 
 
 def scene_file(folder: Path, name: str, color: float = 0.2) -> str:
-    """A ball on a plane as a scene file."""
+    """Write a scene file with a ball on a plane."""
     things = [
         {"name": "ground", "foreground": False, "shape": {"type": "plane", "size": [6, 6]}},
         {
@@ -59,7 +59,7 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Bench:
 
 @pytest.fixture(scope="module")
 def rendered(bench: Bench, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the development half."""
+    """Render the development half."""
     pytest.importorskip("mitsuba", reason="no Mitsuba -> pip install '.[synth]'")
     out = tmp_path_factory.mktemp("bench")
     assert run_bench(out, RENDER, bench=bench) is None
@@ -68,7 +68,7 @@ def rendered(bench: Bench, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def compared(monkeypatch: pytest.MonkeyPatch) -> list[tuple[tuple[Any, ...], dict[str, Any]]]:
-    """What is asked of ``compare``, which does nothing."""
+    """Replace ``compare`` and record its arguments."""
     calls: list[tuple[tuple[Any, ...], dict[str, Any]]] = []
 
     def compare(*arguments: Any, **more: Any) -> str:
@@ -83,9 +83,8 @@ def test_the_halves_share_nothing_and_have_all_presets() -> None:
     every = (*BENCH.development, *BENCH.held_back)
     assert len(set(every)) == len(every) == 11
     assert set(every) == set(PRESETS) - {"glossy", "proof"}
-    names = renderer.view_names(BENCH.views)
-    assert len(renderer.held_out_names(names, BENCH.synth.test_every)) == 8
-    assert len(names) == 56
+    plan = renderer.Plan(Overrides(views=BENCH.views).apply(find_scene("kit")), BENCH.synth, Path("kit"))
+    assert (len(plan.names), len(plan.tests)) == (56, 8)
     # ``polarguide synth NAME --size 192x144 --views 56 --test-every 7`` renders the same.
     assert BENCH.synth == SynthSettings(size="192x144", test_every=7)
     assert all(find_scene(name).name == name for name in every)
@@ -179,7 +178,7 @@ def changed_preset(bench: Bench) -> Bench:
     [
         (changed_size, "one", "settings.width: 16 in place of 32"),
         (changed_seed, "one", "settings.seed: 0 in place of 1"),
-        (changed_preset, "two", "scene.things[1].material.color[0]: 0.2 in place of 0.4"),
+        (changed_preset, "two", "material.color.0: 0.2 in place of 0.4"),
     ],
 )
 def test_scenes_of_another_version_are_refused(

@@ -27,7 +27,7 @@ from polarguide_bench.plan import jobs_at_a_time
 
 @pytest.fixture
 def scheduler() -> Iterator[Any]:
-    """A scheduler with two workers, each a process that is started again when it is killed."""
+    """Start a scheduler with two workers. Each is a process that restarts after a kill."""
     import dask
     from distributed import LocalCluster
 

@@ -25,23 +25,26 @@ from polarguide_bench.children import COMMAND, Message, Scoring, Training, files
 from polarguide_bench.job_queue import MOST_LOSSES, Job, Workers, last_row, run_job, run_jobs, workers
 from polarguide_bench.options import ClusterOptions
 
-# Reads its task, writes down that it begins, does what the name of the device asks for, and writes down the end.
+# Reads its task, records its start, and behaves as the name of the device requests.
 PROGRAM = """
 import json, os, pathlib, signal, sys, time
 task = json.loads(sys.stdin.readline())["task"]
 verb, folder = task["compute"]["device"], pathlib.Path(task["folder"])
 with open(folder / "did", "a") as did:
     print(verb, task["compute"]["threads"], os.environ["OMP_NUM_THREADS"], file=did)
+
 begun = len((folder / "did").read_text().splitlines())
 if verb == "fail":
     print("a warning\\n" + folder.name + " is broken.\\n", file=sys.stderr)
     sys.exit(2)
 if verb == "quiet":
     sys.exit(3)
+
 if verb == "always killed" or verb == "killed" and begun <= 4:
     os.kill(os.getpid(), signal.SIGKILL)
 if verb == "preempted" and begun == 1:
     sys.exit(130)
+
 if verb in ("wait", "deaf"):
     (folder / "ready").touch()
     assert sys.stdin.read() == ""
@@ -65,7 +68,7 @@ def two(monkeypatch: pytest.MonkeyPatch) -> Iterator[Workers]:
 
 @pytest.fixture
 def job(tmp_path: Path) -> Callable[..., Job]:
-    """Makes a job of the stand-in's verbs."""
+    """Return a function that makes a job of the stand-in's verbs."""
 
     def make(name: str, *verbs: str) -> Job:
         folder = tmp_path / name
@@ -270,7 +273,7 @@ def training(scene: Path, folder: Path, steps: int = 20) -> Training:
 
 @contextlib.contextmanager
 def child(task: Training, folder: Path) -> Iterator["subprocess.Popen[bytes]"]:
-    """A child at work on a task, with its standard input open."""
+    """Start a child on a task, with its standard input open."""
     pipes = {"stdin": subprocess.PIPE, "stderr": subprocess.PIPE}
     with subprocess.Popen(COMMAND, cwd=folder, **pipes) as process:  # type: ignore[call-overload]
         process.stdin.write(Message(task, files_digest(), "").to_line())

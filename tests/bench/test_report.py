@@ -107,7 +107,7 @@ def test_nothing_comes_from_outside() -> None:
 
 
 def bench() -> Results:
-    """A comparison with controls, objects, unequal seeds and runs that are missing."""
+    """Return a comparison with controls, objects, unequal seeds and missing runs."""
     rng = np.random.default_rng(0)
     runs = []
     levels = {

@@ -41,13 +41,13 @@ AUDITED = {"psnr": 0.23, "psnr_foreground": 0.10, "normal_mae_deg": 0.46} | dict
 
 
 def trained(scene: str, recipe: str, seed: int, views: dict[str, float], key: str = "psnr") -> dict[str, Any]:
-    """A finished run with a metric by view."""
+    """Return a finished run with a metric by view."""
     made = run(scene, recipe, seed, **{key: float(np.mean(list(views.values())))})
     return made | {"views": {view: {key: value} for view, value in views.items()}}
 
 
 def one(found: Results, **wanted: Any) -> pd.Series:
-    """The only difference with these values; the scene of a difference over scenes is "all"."""
+    """Return the only difference with these values. The scene of a difference over scenes is "all"."""
     frame = found.differences.fillna({"scene": "all"})
     for key, value in wanted.items():
         frame = frame[frame[key] == value]
@@ -224,7 +224,7 @@ def test_differences_are_to_a_recipe_that_was_asked_for_and_of_no_seconds_or_cou
 
 
 def leading(key: str, table: dict[str, dict[int, float]], black: tuple[str, ...] = ()) -> set[str]:
-    """The recipes that lead in a column, of values by recipe and seed on one scene."""
+    """Return the leading recipes of a column from values by recipe and seed on one scene."""
     runs = [run("cup", recipe, seed, **{key: v}) for recipe, by in table.items() for seed, v in by.items()]
     ((_, rows),) = scores_section(results(runs, black=black)).blocks
     return {labels[0][0] for labels, cells in rows if cells[0][2]}
@@ -236,7 +236,7 @@ LUCK = (0.0, 2.0, 4.0)
 @pytest.mark.parametrize(
     ("key", "table", "black", "best"),
     [
-        # What is not told from the best shares its mark: 1.96 times 0.23 is 0.45.
+        # Rows within noise of the best share its mark: 1.96 times 0.23 is 0.45.
         ("psnr", {"best": {0: 31.0}, "near": {0: 30.6}, "far": {0: 30.5}}, False, {"best", "near"}),
         # On black a seed moves the picture by 1.5 dB, and not the foreground.
         ("psnr", {"best": {0: 31.0}, "near": {0: 30.6}, "far": {0: 30.5}}, True, set()),
@@ -317,7 +317,7 @@ def test_the_page_gives_the_known_scatter_and_the_power_of_seeds() -> None:
 
 
 def power(ratio: float, seeds: int) -> float:
-    """The chance that an interval over seeds leaves out 0, if the difference is ``ratio`` of its scatter."""
+    """Return the probability that an interval over seeds excludes 0, if the difference is ``ratio`` of its scatter."""
     shift, critical = ratio * seeds**0.5, stats.t.ppf(0.975, seeds - 1)
     beyond = stats.nct(seeds - 1, shift)
     return float(beyond.sf(critical) + beyond.cdf(-critical))

@@ -40,7 +40,7 @@ FREE, LOOSE = "r:unpolarized", "r:unpolarized-without-consistency"
 
 
 def seen(scene: str, recipe: str, seed: int, **parts: dict[str, Any]) -> dict[str, Any]:
-    """A run with objects, and with materials of the same scores."""
+    """Return a run with objects, and with materials of the same scores."""
     made = run(scene, recipe, seed, psnr=30.0)
     materials = {scores["material"]: scores for scores in parts.values() if scores["material"]}
     return made | {"objects": parts, "materials": materials}
@@ -203,7 +203,7 @@ def test_a_row_for_every_object_and_a_column_for_every_recipe() -> None:
     }
     assert rows(section, 1) == {("x", "ball", "metal"): ["", "20.00"]}
     assert rows(section, 2) == {("x", "ball", "metal"): ["81.5", ""]}
-    # Of r, the metal of one scene is missing: its mean would be one of other scenes.
+    # The recipe r lacks the metal of one scene, so its mean would be over other scenes.
     assert rows(part_section(found, "material")) == {
         ("metal", "x, y"): ["20.00", ""],
         ("plastic", "x"): ["25.00", "26.00"],
@@ -254,7 +254,7 @@ def test_frames_are_the_csv_files(tmp_path: Path) -> None:
         30.123456789,
     ]
     assert parts.loc["ball", "metal_share_percent"] == 75
-    # What an earlier comparison in the folder had, and this one has not, goes.
+    # Files of an earlier comparison in the folder are removed.
     write_tables(tmp_path, results([run("z", "r", 0, psnr=1.0)]))
     assert sorted(path.suffix for path in tmp_path.iterdir()) == [".csv", ".json", ".md", ".tex"]
 

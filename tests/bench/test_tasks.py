@@ -1,4 +1,4 @@
-"""What is done for a run by how far it is, and which of its speeds count."""
+"""Tasks of a run by its state, and the validity of its speeds."""
 
 import dataclasses
 import json
@@ -38,7 +38,7 @@ Planned = tuple[Comparison, list[SceneEntry], PlannedRun]
 
 @pytest.fixture
 def planned(demo_scene: Path, tmp_path: Path) -> Planned:
-    """A comparison with one run, of which nothing is there yet."""
+    """Return a comparison with one new run."""
     question = Comparison(
         scenes=(demo_scene,),
         recipes=(recipe_named("polarguide-stokes"),),
@@ -112,7 +112,7 @@ def test_objects_materials_and_black_pixels_are_collected(planned: Planned, trai
     (run,) = collect(question, scenes, [only], {}).record.runs
     assert run.objects == {"ball": PartScores("metal", 7, 1, values)}
     assert run.materials == {"metal": PartScores(None, 7, 1, values)}
-    # What an earlier comparison in the folder had, and this one has not, goes.
+    # Files of an earlier comparison in the folder are removed.
     (question.out / "differences.csv").touch()
     write_tables(question.out, collect(question, scenes, [only], {}))
     assert sorted(path.name for path in question.out.glob("*.*")) == [

@@ -172,7 +172,7 @@ DAMAGE = {
     "truncated": (lambda data: data[:-100], "damaged or foreign data"),
     "cut in the header": (lambda data: data[:40], "damaged or foreign data"),
     "empty": (lambda data: b"", "damaged or foreign data"),
-    "a bit flipped": (flipped, "other content: the file is damaged, or was changed"),
+    "a bit flipped": (flipped, "other content"),
     "another sensor written over": (lambda data: changed_metadata(data, sensor="IMX264MYR"), "other content"),
     "another version": (lambda data: changed_metadata(data, version=2), "version 2"),
     "an unknown field": (lambda data: changed_metadata(data, date="today"), "found date"),

@@ -237,7 +237,7 @@ FAULTS: dict[str, tuple[Callable[[TinyCapture], object], Fault]] = {
         Fault("images.bin", found="an image whose pose is not finite"),
     ),
     "no turn": (
-        edited("images.txt", "1 1 0 0 0 ", "1 0 0 0 0 "), Fault("image v000.png", "a unit quaternion", "quaternion")
+        edited("images.txt", "1 1 0 0 0 ", "1 0 0 0 0 "), Fault("image v000.png", "a quaternion of length 1")
     ),
     "a negative focal length": (
         edited("cameras.txt", "PINHOLE 12 10 15.5", "PINHOLE 12 10 -15.5"),

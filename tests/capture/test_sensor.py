@@ -81,7 +81,7 @@ def test_patterns_and_their_offsets(sensor: str, rows: tuple[str, ...]) -> None:
 def test_a_sensor_is_named_in_any_case(settings: type[MosaicOptions]) -> None:
     for name in SENSORS:
         assert settings(sensor=name.lower()).checked().sensor == name  # type: ignore[arg-type, attr-defined]
-    unknown = Fault("--sensor", found="'imx'", expected="TRI050S-P", remedy="IMX250MZR has the same pattern")
+    unknown = Fault("--sensor", found="'imx'", expected="TRI050S-P", remedy="IMX250MZR has the pattern")
     unknown.raised_by(settings(sensor="imx").checked)  # type: ignore[arg-type, attr-defined]
 
 

@@ -71,7 +71,7 @@ def test_a_capture_without_poses(unposed: Path, tmp_path: Path, capsys: pytest.C
     assert "inspection.html" in printed.out
     said = "verdict: not verified: order of the angles, sense of the angles, zero of the angles"
     assert said in printed.out
-    assert printed.out.count("Give the scene poses") == 1
+    assert printed.out.count("Prepare the scene with poses") == 1
     tags = Tags()
     tags.feed(page)
     assert tags.open == []

@@ -51,7 +51,7 @@ def test_mosaics_to_a_trained_scene(
     np.testing.assert_allclose(after[::2, ::2, 2], before[::2, ::2, 2] * factor, atol=1.5)
     assert np.abs(after.astype(float) - before * factor).mean() < 0.05 * 65535
     assert run(command) == 0
-    assert "complete already" in capsys.readouterr().out
+    assert "already complete" in capsys.readouterr().out
     assert run(["train", scene, "--out", out, "--steps", "4", "--downscale", "4", "--threads", "1"]) == 0
 
 
@@ -63,7 +63,7 @@ def test_a_dataset_becomes_a_scene_that_trains(tmp_path: Path, capsys: pytest.Ca
     assert "4 views, format nersp" in printed
     assert "Four-angle sum check: n/a" in printed
     assert "warning: The sense of nersp's angles is uncertain" in printed
-    assert "Angles count clockwise as displayed, as assumed (--sense and --zero say otherwise)" in printed
+    assert "Angles count clockwise as displayed, by assumption" in printed
     assert "sampled at random in the hull of the masks" in printed
     assert run(["train", scene, "--out", out, "--steps", "2", "--threads", "1"]) == 0
 

@@ -111,7 +111,7 @@ def test_from_shots_to_a_corrected_scene(
         "polarizer at",
         "extinction ratio",
         "135 deg",
-        "Angles were estimated",
+        "angles were estimated",
         "picture: camera.png",
     ):
         assert expected in said

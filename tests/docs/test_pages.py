@@ -11,7 +11,7 @@ import polarguide
 from polarguide.recipes import RECIPES
 from polarguide.results.evaluation.table import METRICS
 from polarguide_bench.recipes import ABLATIONS
-from polarguide_shots.measurement.fields import FORMAT, KEYS
+from polarguide_shots.measurement.table import FORMAT, KEYS
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"

@@ -8,7 +8,7 @@ from polarguide_bench.results import FORMAT, Record, Results
 
 
 def run(scene: str, recipe: str, seed: int, **metrics: float | None) -> dict[str, Any]:
-    """A finished run with these metrics; all others are null."""
+    """Return a finished run with these metrics. All others are null."""
     values = {**dict.fromkeys(c.key for c in COLUMNS), **metrics}
     return {
         "scene": scene,
@@ -26,12 +26,12 @@ def run(scene: str, recipe: str, seed: int, **metrics: float | None) -> dict[str
 
 
 def part(material: str | None = None, **metrics: float | None) -> dict[str, Any]:
-    """What a run scores on an object or a material."""
+    """Return scores of a run on an object or a material."""
     return {"material": material, "pixels": 100, "views": 2, "metrics": metrics}
 
 
 def unfinished(scene: str, recipe: str, seed: int, error: str | None = None) -> dict[str, Any]:
-    """A run that failed with an error, or that has not run."""
+    """Return a failed run if there is an error, else a missing one."""
     blank = {"metrics": None, "views": {}, "lpips_reason": None, "objects": {}, "materials": {}}
     return run(scene, recipe, seed) | blank | {"state": "failed" if error else "missing", "error": error}
 
@@ -42,7 +42,7 @@ def content(
     black: tuple[str, ...] = (),
     **provenance: Any,
 ) -> dict[str, Any]:
-    """The record of these runs as JSON; ``black`` are the scenes on black."""
+    """Return the record of these runs as JSON; ``black`` are the scenes on black."""
     scenes, recipes = (list(dict.fromkeys(r[key] for r in runs)) for key in ("scene", "recipe"))
     made = {
         "version": "1",
@@ -65,5 +65,5 @@ def content(
 
 
 def results(runs: list[dict[str, Any]], **more: Any) -> Results:
-    """A comparison of these runs; further arguments as for ``content``."""
+    """Return a comparison of these runs. Further arguments are those of ``content``."""
     return Results(decode(content(runs, **more), Record, "results.json"))

@@ -10,7 +10,7 @@ SMALL_SAMPLING = Sampling(rays=48, coarse=12, fine=8, background=4, neighbors=2)
 
 
 def small(recipe: NeuralRecipe = RECIPE_GNERP, **weights: float) -> NeuralRecipe:
-    """A recipe with small grids and few rays, and some of its weights changed."""
+    """Return a recipe with small grids and few rays, and some changed weights."""
     return replace(
         recipe,
         name="gnerp-small",

@@ -85,7 +85,7 @@ def test_exposures_that_leave_the_pair_sums_alike_are_measured(tmp_path, stops: 
 def test_dark_and_unscaled_files_are_flagged(tmp_path) -> None:
     found = checked(write_scene(tmp_path / "s", lambda v: v * 0.004))
     assert found["noise"].verdict == "wrong"
-    assert "were not scaled" in found["saturation"].remedy
+    assert "not scaled" in found["saturation"].remedy
 
 
 def test_saturation_is_flagged_with_its_views(tmp_path) -> None:

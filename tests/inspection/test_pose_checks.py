@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import warnings
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -41,11 +40,10 @@ def test_cameras_in_one_place_have_no_epipolar_lines(moved: float) -> None:
     turn = torch.eye(3, dtype=torch.float64)
     places = [torch.tensor([k * moved, 0, 0], dtype=torch.float64) for k in range(2)]
     cameras = [Camera(80, 80, 90.0, 90.0, 40.0, 40.0, turn, place) for place in places]
-    first, second = (SimpleNamespace(name=f"v{k}", camera=camera) for k, camera in enumerate(cameras))
-    features = points, descriptors
+    first, second = ((f"v{k}", camera, points, descriptors) for k, camera in enumerate(cameras))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        found = _pair_error(first, second, features, features, 1)
+        found = _pair_error(first, second, 1)
     assert (found is None) == (moved == 0.0)
 
 

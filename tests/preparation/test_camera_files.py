@@ -163,7 +163,7 @@ def test_labels_of_objects_are_no_mask(tmp_path, levels):
     path = tmp_path / "v.png"
     discs = [np.hypot(*(np.mgrid[:60, :90] - np.array([[[30]], [[15 + 30 * k]]]))) < 9 for k in range(3)]
     cv2.imwrite(str(path), np.sum([d * v for d, v in zip(discs, levels, strict=True)], 0).astype(np.uint8))
-    Fault(found=f"areas of {levels[0]} beside a maximum of {levels[2]}").raised_by(
+    Fault(found=f"areas of {levels[0]} and a maximum of {levels[2]}").raised_by(
         decode_mask, path, path.read_bytes(), any_value=False
     )
     cv2.imwrite(str(path), cv2.GaussianBlur(np.any(discs, 0) * np.uint8(255), (0, 0), 3))
@@ -445,9 +445,9 @@ def test_the_full_scale_that_a_file_states_is_used(tmp_path, kind, full):
     source = MosaicSource(tmp_path, settings)
     measured = source.measure(lambda done: None)
     assert (measured.levels.white, measured.levels.saturation) == (full, full)
-    assert f"{full} is full scale, as the files state" in measured.notes[-1]
+    assert f"{full} is full scale" in measured.notes[-1]
     shot = read_shot(path, ShotOptions(sensor="IMX250MZR"))
-    assert any("full scale, as the file" in note for note in shot.notes)
+    assert any("full scale" in note for note in shot.notes)
 
 
 def test_significant_bits_of_png_may_be_at_the_top(tmp_path):

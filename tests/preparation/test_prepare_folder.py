@@ -75,15 +75,15 @@ def test_a_preparation_that_could_not_write_at_all_is_begun_again(
 def test_a_stopped_preparation_gives_the_same_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_mosaics(tmp_path / "in", 3)
     prepare_scene(tmp_path / "in", tmp_path / "whole", MOSAIC)
-    write, count = prepare_module.SceneFolder.write_view, [0]
+    write, count = prepare_module.write_view, [0]
 
-    def stop(self: object, *arguments: object) -> None:
+    def stop(*arguments: object) -> object:
         count[0] += 1
         if count[0] == 2:
             raise KeyboardInterrupt
-        write(self, *arguments)  # type: ignore[arg-type]
+        return write(*arguments)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(prepare_module.SceneFolder, "write_view", stop)
+    monkeypatch.setattr(prepare_module, "write_view", stop)
     with pytest.raises(KeyboardInterrupt):
         prepare_scene(tmp_path / "in", tmp_path / "out", MOSAIC)
     assert not (tmp_path / "out" / "scene.json").exists()

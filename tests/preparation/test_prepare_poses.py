@@ -32,11 +32,10 @@ from heard import Heard
 from relief import DEPTHS, write_relief
 
 from polarguide.capture import load_scene
-from polarguide.capture.colmap import triangulate as points_module
+from polarguide.capture.colmap import sfm as points_module
 from polarguide.capture.colmap.model import PosedCamera, posed_model
-from polarguide.capture.colmap.sfm import match_features, tone_mapped
-from polarguide.capture.colmap.triangulate import sample_visual_hull
-from polarguide.capture.write import write_png
+from polarguide.capture.colmap.sfm import match_features, sample_visual_hull, tone_mapped
+from polarguide.capture.write import write_png_file
 from polarguide.core.progress import SILENT
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import PrepareSettings
@@ -469,7 +468,9 @@ def test_pictures_of_one_size_share_a_camera(
     """A camera that was held upright and on its side has two cameras in the model, not one for each picture."""
     rng = np.random.default_rng(0)
     for view, (width, height) in sizes.items():
-        write_png(tmp_path / "images" / f"{view}.png", rng.integers(0, 255, (height, width, 3), np.uint8))
+        write_png_file(
+            tmp_path / "images" / f"{view}.png", rng.integers(0, 255, (height, width, 3), np.uint8)
+        )
     database = tmp_path / "database.db"
     match_features(
         database, tmp_path / "images", sizes, matching="exhaustive", seed=0, reporter=SILENT

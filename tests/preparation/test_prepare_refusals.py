@@ -134,7 +134,7 @@ SHOTS: dict[str, tuple[Callable[[Path], object], PrepareSettings, Fault]] = {
         lambda d: (d / "90" / "b.png").unlink(), FILTER,
         Fault(expected="shots of view b", found="none at 90")
     ),
-    "missing folder": (lambda d: shutil.rmtree(d / "135"), FILTER, Fault(found="none for 135 degrees")),
+    "missing folder": (lambda d: shutil.rmtree(d / "135"), FILTER, Fault(found="none for 135")),
     "two folders for an angle": (lambda d: (d / "I-45").mkdir(), FILTER, Fault(expected="one folder for 45 degrees")),
     "duplicate shot": (
         lambda d: shutil.copy(d / "0" / "a.png", d / "0" / "a.tif"), FILTER,

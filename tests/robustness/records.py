@@ -41,7 +41,7 @@ CASES += table(
     Case("with scripts, inspected", write_json("scene/presentation.json", SCRIPTS), INSPECT, passes=ESCAPED,
          check=no_script),
     Case("with a key twice", write(PRESENTED, '{"title": "a", "title": "b"}'), export("ply"),
-         found="stands there twice", ci=True),
+         found="occurs twice", ci=True),
     Case("is a pipe", put(PRESENTED, "pipe"), ci=True),
     *(Case(name, change, "present scene", passes=reason) for name, change, reason in text_forms(
         "scene/presentation.json", {"meters_per_unit": 1.0}, "meters_per_unit")),

@@ -74,7 +74,7 @@ CASES += table(
     Case("without test views", _set("test_views", to=[]), expected="test views to score", ci=True),
     Case("with a version of a million letters", edit(RECORD, lambda given: given.replace(
         '"version": "', '"version": "' + "v" * 1_000_000)), RENDER, prints=r"\A.{,2000}\Z", ci=True),
-    Case("with a key twice", TWICE, RENDER, found="stands there twice", ci=True),
+    Case("with a key twice", TWICE, RENDER, found="occurs twice", ci=True),
     Case("of 2 GiB", sparse(RECORD, (1 << 31) - 1, b"{"), ci=True),
 )  # fmt: skip
 

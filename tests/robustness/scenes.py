@@ -38,7 +38,7 @@ CASES += table(
     "scene.json", READ,
     Case("of 2 GiB", sparse(SCENE, (1 << 31) - 1, b"{"), ci=True),
     Case("with a key twice", write(SCENE, '{"refractive_index": 1.5, "refractive_index": 1.9}'),
-         found="stands there twice", ci=True),
+         found="occurs twice", ci=True),
     Case("with a polarizer of brackets", write_json(SCENE, {"polarizer": {"a": [1]}})),
     Case("of a prepared scene, with gains of words", field("prepared/scene.json", "gains", to={"0": 0, "45": "x"}),
          f"{of('prepared', INSPECT)} --fix fixed", passes=UNUSED),

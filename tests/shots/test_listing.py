@@ -35,7 +35,7 @@ def good_and_bad(found: list[ExposureSet]) -> tuple[list[str], dict[str, str]]:
 
 @pytest.fixture
 def parts(tmp_path: Path) -> Path:
-    """A folder of the shots cup and jar."""
+    """Write a folder of the shots cup and jar."""
     for name in ("cup", "jar"):
         write_four(tmp_path / "parts", tuple(f"{name}_{angle}.png" for angle in ANGLES))
     return tmp_path / "parts"

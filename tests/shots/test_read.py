@@ -272,7 +272,7 @@ BITS = {
 @pytest.mark.parametrize("case", sorted(BITS))
 @pytest.mark.parametrize("angles", [ANGLES, (0, 30, 60, 90, 120, 150)], ids=["four", "six"])
 def test_values_of_fewer_bits_in_16(tmp_path: Path, angles: tuple[int, ...], case: str) -> None:
-    """What clips is saturated. Full scale is never guessed from a single shot: those of a series would differ."""
+    """Clipped pixels are saturated. A single shot does not determine the full scale, which is equal in a series."""
     top, given, white = BITS[case]
     stored = [np.minimum(np.rint(1.85 * malus(light(), math.radians(angle)) * top), top) for angle in angles]
     paths = [tmp_path / f"cup_a{angle}.png" for angle in angles]

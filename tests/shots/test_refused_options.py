@@ -105,7 +105,10 @@ def test_a_name_that_leads_out_of_the_folder(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("error", "said"),
-    [(PermissionError(13, "Permission denied"), "Permission denied"), (MemoryError(), "more memory than")],
+    [
+        (PermissionError(13, "Permission denied"), "Permission denied"),
+        (MemoryError(), "too little free memory"),
+    ],
 )
 def test_no_error_of_one_shot_stops_the_others(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: Exception, said: str

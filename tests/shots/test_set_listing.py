@@ -14,7 +14,7 @@ import polarguide
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import PrepareSettings
 from polarguide_shots.exposures import find_shots, list_shots
-from polarguide_shots.measurement.fields import KEYS
+from polarguide_shots.measurement.table import KEYS
 from polarguide_shots.options import ShotOptions, WatchOptions
 from polarguide_shots.read import read_shot
 from polarguide_shots.sets import ExposureSet
@@ -159,7 +159,7 @@ def test_the_residual_is_written(tmp_path: Path) -> None:
     page = (folder / "shot.html").read_text()
     assert "looks like 90" in page
     assert ">residual<" in page
-    # Of a shot of four of this name, nothing of the set stays.
+    # A later shot of four with this name replaces all files of the set.
     for path in (tmp_path / "in").iterdir():
         path.unlink()
     write(tmp_path / "in", [f"cup_{angle}.png" for angle in (0, 45, 90, 135)], (0, 45, 90, 135))

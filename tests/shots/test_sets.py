@@ -31,7 +31,7 @@ def read(
 
 
 def reduced_chi_square(maps: ShotMaps, stokes: np.ndarray) -> tuple[float, float]:
-    """Of DoLP and AoLP, where the signal is well over noise."""
+    """Return the values for DoLP and AoLP of pixels with a strong signal."""
     degree, angle = np.hypot(stokes[1], stokes[2]) / stokes[0], np.arctan2(stokes[2], stokes[1]) / 2
     good = maps.usable & (degree > 8 * maps.sigma_dolp)
     assert good.mean() > 0.4

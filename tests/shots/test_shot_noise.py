@@ -28,7 +28,7 @@ def write_mosaic(
     well: float = 0.0,
     ramp: bool = True,
 ) -> None:
-    """A mosaic of one polarization, in brightness from left to right, with shot noise of ``well`` electrons."""
+    """Write a mosaic of one polarization and a brightness ramp, with shot noise of ``well`` electrons."""
     pattern = sensor_pattern(sensor)
     s0 = np.linspace(0.3, 1.1, side) if ramp else np.full(side, 0.7)
     if pattern.colors is not None:
@@ -66,7 +66,7 @@ def test_sigma_of_a_mosaic_is_the_spread_of_its_maps(tmp_path: Path, sensor: str
 
 @pytest.mark.parametrize("colors", [1, 3])
 def test_sigma_of_shots_is_the_spread_of_their_maps(tmp_path: Path, colors: int) -> None:
-    """Of gray files, too, whose three colors are one sample."""
+    """Gray files are included. Their three colors are one sample."""
     rng, well = np.random.default_rng(6), 5000.0
     for angle in ANGLES:
         clean = np.full((256, 256, colors), malus((0.7, 0.7 * 0.25, 0.0), math.radians(angle)))

@@ -73,7 +73,7 @@ def test_the_chosen_candidate_is_the_nearest_to_facing_the_camera() -> None:
 
 
 def made(degree: np.ndarray, angle: np.ndarray) -> ShotMaps:
-    """Maps of a shot of given DoLP and AoLP, read from four arrays as the program does it."""
+    """Read the maps of a shot of given DoLP and AoLP from four arrays."""
     s = np.stack(
         (np.full_like(degree, 0.8), 0.8 * degree * np.cos(2 * angle), 0.8 * degree * np.sin(2 * angle))
     )

@@ -9,7 +9,7 @@ from polarguide_synth.settings import Variant, choose_variant
 
 @pytest.fixture(scope="session", params=["compiled", "scalar"])
 def variant(request: pytest.FixtureRequest) -> Iterator[Variant]:
-    """A polarized variant, which is current: the one that is taken with LLVM, and the one without."""
+    """Select a polarized variant, with and without LLVM."""
     pytest.importorskip("mitsuba", reason="no Mitsuba -> pip install '.[synth]'")
     with pytest.MonkeyPatch.context() as patch:
         if request.param == "scalar":

@@ -107,11 +107,17 @@ class AngleEstimate:
         angle: estimated angle in degrees; None if the picture does not determine it.
         error: standard error of the estimate, degrees.
         stated: stated angle in degrees; None if it is unknown.
+        floor: smallest difference that matters, degrees.
+        usual: median of the absolute differences of all pictures, degrees.
+        sigmas: number of standard errors that count as chance.
     """
 
     angle: float | None
     error: float
     stated: float | None
+    floor: float
+    usual: float = 0.0
+    sigmas: float = AngleLimits.sure
 
     @property
     def off(self) -> float:
@@ -119,9 +125,15 @@ class AngleEstimate:
         unknown = self.angle is None or self.stated is None
         return 0.0 if unknown else float(angle_difference(self.angle, self.stated))
 
-    def contradicts(self, floor: float, usual: float = 0.0, *, sigmas: float = AngleLimits.sure) -> bool:
-        """Return True if the difference exceeds ``tolerance``."""
-        return abs(self.off) > tolerance(floor, self.error, usual, sigmas=sigmas)
+    @property
+    def limit(self) -> float:
+        """Largest difference that does not contradict the stated angle, degrees."""
+        return tolerance(self.floor, self.error, self.usual, sigmas=self.sigmas)
+
+    @property
+    def contradicts(self) -> bool:
+        """True if the difference exceeds the limit."""
+        return abs(self.off) > self.limit
 
 
 def jackknife_error(estimate: Any, without: Any) -> Any:

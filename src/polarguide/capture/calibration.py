@@ -20,13 +20,13 @@ Gains = tuple[Gain, Gain, Gain, Gain]
 Sense = Literal["ccw", "cw"]
 UNIT_GAINS: Gains = (1.0, 1.0, 1.0, 1.0)
 LARGEST_IMBALANCE = 0.1
-"""Pair sums that differ by more than this share are no gain differences: files are swapped, or not linear."""
+"""Largest relative difference of pair sums by gains; more means swapped or nonlinear files."""
 LARGEST_ZERO = 3600.0
-"""Degrees; farther, a number says less and less about an angle."""
+"""Largest zero of the angles in degrees."""
 ROTATED_PEAK = (1.0 + math.sqrt(2.0)) / 2.0
-"""The most a turned analyzer can measure where four angles stay under 1."""
+"""Largest intensity behind a rotated analyzer if four angles have at most 1."""
 UNIDENTIFIED = (
-    "Gains inside a pair (0 against 90, 45 against 135 degrees) look like polarization and stay: polarguide calibrate "
+    "Gains within a pair (0 and 90, or 45 and 135 degrees) look like polarization and remain: polarguide calibrate "
     "measures them."
 )
 _FEWEST = 32
@@ -34,15 +34,15 @@ _FEWEST = 32
 
 @dataclass(frozen=True)
 class Calibration:
-    """How the pictures called 0, 45, 90 and 135 relate to polarizer angles as displayed.
+    """Relation of the pictures named 0, 45, 90 and 135 to displayed polarizer angles.
 
     Attributes:
-        gains: response of the pictures, in the order of their names; intensities are divided by them. None
-            to estimate the ratio of the pair sums.
-        order: the angle that each of the pictures called 0, 45, 90 and 135 was really taken at.
-        sense: "ccw" or "cw", how these angles count as the picture is displayed; None for what is usual for the
-            source: "ccw", but for published datasets that say otherwise.
-        zero: where their zero lies, in degrees counter-clockwise from the image's horizontal.
+        gains: response of the pictures in the order of their names, by which intensities are divided. None to estimate
+            the ratio of the pair sums.
+        order: true angle of each of the pictures named 0, 45, 90 and 135.
+        sense: direction of the angles as displayed, "ccw" or "cw"; None for the default of the source, which is "ccw"
+            except for some published datasets.
+        zero: direction of angle zero, in degrees counter-clockwise from the image's horizontal.
     """
 
     gains: Gains | None = None
@@ -52,35 +52,35 @@ class Calibration:
 
     @property
     def permutes(self) -> bool:
-        """Whether the pictures only change places."""
+        """True if the calibration only permutes pictures."""
         return (self.zero / 45.0).is_integer()
 
     @property
     def peak(self) -> float:
-        """The largest intensity that comes out where none exceeds 1."""
+        """Largest calibrated intensity for intensities up to 1."""
         return 1.0 if self.permutes else ROTATED_PEAK
 
     def record(self) -> dict[str, Any]:
-        """Order, sense and zero for ``scene.json``."""
+        """Return order, sense and zero for ``scene.json``."""
         return {"order": list(self.order), "sense": self.sense or "ccw", "zero_degrees": self.zero}
 
     def true_angles(self) -> tuple[tuple[int, ...], float]:
-        """The true angles of the pictures called 0, 45, 90 and 135: multiples of 45, and what is left for all four."""
+        """Return the true angles of the pictures named 0, 45, 90 and 135 as multiples of 45, and their common rest."""
         sign = -1 if self.sense == "cw" else 1
         steps = 45 * round(self.zero / 45.0)
         return tuple((sign * angle + steps) % 180 for angle in self.order), self.zero - steps
 
     def options(self) -> str:
-        """Order, sense and zero as options of ``prepare``."""
+        """Return order, sense and zero as options of ``prepare``."""
         order = ",".join(map(str, self.order))
         return f"--order {order} --sense {self.sense or 'ccw'} --zero {self.zero:g}"
 
 
 def checked(calibration: Calibration, where: object) -> Calibration:
-    """The calibration, if it makes sense.
+    """Validate a calibration and return it.
 
     Raises:
-        PolarguideError: gains are not positive, the order is no permutation, the zero is not finite, ...
+        PolarguideError: gains are not positive, the order is not a permutation, the zero is not finite, ...
     """
     check_options(calibration, lambda field: f"{where} ({field})")
     require(
@@ -94,11 +94,11 @@ def checked(calibration: Calibration, where: object) -> Calibration:
 
 
 def combined(first: Calibration, second: Calibration) -> Calibration | None:
-    """One calibration in place of two: ``second`` was found on pictures to which ``first`` was applied.
+    """Combine two calibrations into one; ``second`` was measured on pictures corrected by ``first``.
 
     Returns:
-        Order, sense and zero, without gains; None where no calibration says the same (pictures that ``first`` turned
-        by a part of 45 degrees, and ``second`` pairs otherwise).
+        Order, sense and zero, without gains. None if no calibration is equivalent: ``first`` rotated the pictures by a
+        fraction of 45 degrees, and ``second`` pairs them differently.
     """
     named, turn = first.true_angles()
     renamed, more = second.true_angles()
@@ -117,7 +117,7 @@ def combined(first: Calibration, second: Calibration) -> Calibration | None:
 
 
 def _count(sign: int, zero: int) -> tuple[int, ...]:
-    """The angles named 0, 45, 90 and 135 where angles count one way from a zero."""
+    """Return the true angles of the pictures named 0, 45, 90 and 135 for a direction and a zero."""
     return tuple((sign * angle + zero) % 180 for angle in ANGLES)
 
 
@@ -129,7 +129,7 @@ class _Gains(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class _File(msgspec.Struct, forbid_unknown_fields=True):
-    """A calibration file."""
+    """Content of a calibration file."""
 
     gains: _Gains | None = None
     order: tuple[int, int, int, int] = ANGLES
@@ -140,25 +140,32 @@ class _File(msgspec.Struct, forbid_unknown_fields=True):
 def read_calibration(path: Path) -> Calibration:
     """Read a calibration file: ``{"gains": {"0": 1.01, ...}, "order": [...], "sense": "ccw", "zero": 0.0}``.
 
-    Every key may be left out.
+    All keys are optional.
 
     Raises:
-        PolarguideError: the file cannot be read, has unknown keys or values that make no sense.
+        PolarguideError: the file cannot be read, or has unknown keys or invalid values.
     """
     file = read_record(path, _File, remedy="See docs/reference/formats.md for the calibration file.")
-    gains = None if file.gains is None else msgspec.structs.astuple(file.gains)
-    return checked(Calibration(gains, file.order, file.sense, file.zero), path)
+    return checked(
+        Calibration(
+            None if file.gains is None else msgspec.structs.astuple(file.gains),
+            file.order,
+            file.sense,
+            file.zero,
+        ),
+        path,
+    )
 
 
 def pair_ratio(angles: NDArray[np.floating[Any]], usable: NDArray[np.bool_]) -> float | None:
-    """Median of (I0 + I90) / (I45 + I135), which is 1 for ideal analyzers whatever the light.
+    """Return the median of (I0 + I90) / (I45 + I135), which is 1 for ideal analyzers in any light.
 
     Args:
         angles: linear intensities [4, ...], without channels.
-        usable: [...], what may be looked at.
+        usable: mask of usable samples, [...].
 
     Returns:
-        The ratio, or None where fewer than 32 samples are bright enough to tell.
+        The ratio; None if fewer than 32 samples are bright enough.
     """
     i0, i45, i90, i135 = angles[:, usable].astype(np.float64)
     first = i0 + i90
@@ -170,7 +177,7 @@ def pair_ratio(angles: NDArray[np.floating[Any]], usable: NDArray[np.bool_]) -> 
 
 
 def balancing_gains(ratio: float | None) -> Gains | None:
-    """Gains of the four pictures that explain a ratio of pair sums, with product 1; None if none do."""
+    """Return gains of the four pictures that explain a ratio of pair sums, with product 1; None if it is too large."""
     if ratio is None or abs(ratio - 1.0) > LARGEST_IMBALANCE:
         return None
     root = math.sqrt(ratio)
@@ -178,26 +185,27 @@ def balancing_gains(ratio: float | None) -> Gains | None:
 
 
 def oriented(intensities: NDArray[np.float32], calibration: Calibration) -> NDArray[np.float32]:
-    """Intensities at 0, 45, 90 and 135 degrees, counter-clockwise as displayed.
+    """Return intensities at 0, 45, 90 and 135 degrees, counter-clockwise as displayed.
 
-    A picture taken at angle L of the instrument lies at ``sense * L + zero``. Multiples of 45 degrees exchange
-    pictures; any other zero turns (S1, S2) by twice the angle and forms the four intensities anew.
+    The angle L of the instrument is ``sense * L + zero`` as displayed. Multiples of 45 degrees permute pictures. Any
+    other zero rotates (S1, S2) by twice the angle, from which the four intensities are computed again.
 
     Args:
-        intensities: [4, ...], by the names of the pictures.
-        calibration: order, sense and zero; its gains are not looked at.
+        intensities: intensities by the names of the pictures, [4, ...].
+        calibration: order, sense and zero; gains are ignored.
 
     Returns:
-        [4, ...], at least 0 and at most ``calibration.peak`` times the largest given.
+        [4, ...], at least 0 and at most ``calibration.peak`` times the largest input.
     """
     sign = -1 if calibration.sense == "cw" else 1
     turn = calibration.zero if calibration.permutes else 0.0
     targets = [int(sign * angle + turn) % 180 for angle in calibration.order]
     places = [targets.index(angle) for angle in ANGLES]
-    placed = intensities if places == [0, 1, 2, 3] else intensities[places]
+    permuted = intensities if places == [0, 1, 2, 3] else intensities[places]
     if calibration.permutes:
-        return placed
-    s0, s1, s2 = stokes_of_four(placed)
+        return permuted
+    s0, s1, s2 = stokes_of_four(permuted)
     cosine, sine = (f(2.0 * math.radians(calibration.zero)) for f in (math.cos, math.sin))
-    turned = four_intensities((s0, s1 * cosine - s2 * sine, s1 * sine + s2 * cosine))
-    return np.maximum(np.stack(turned), 0.0).astype(np.float32)
+    return np.maximum(
+        np.stack(four_intensities((s0, s1 * cosine - s2 * sine, s1 * sine + s2 * cosine))), 0.0
+    ).astype(np.float32)

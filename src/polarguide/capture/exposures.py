@@ -141,8 +141,7 @@ def conditioning(analyzers: Tensor) -> float:
 
 def determine_stokes(exposures: Sequence[Exposure]) -> bool:
     """Return True if the known exposures determine a well-conditioned Stokes vector at every pixel."""
-    known = [e for e in exposures if e.known]
-    return conditioning(nominal(known)) >= WELL_CONDITIONED
+    return conditioning(nominal([e for e in exposures if e.known])) >= WELL_CONDITIONED
 
 
 def measure_radiance(exposures: Sequence[Exposure]) -> bool:

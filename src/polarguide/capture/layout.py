@@ -137,7 +137,6 @@ def refuse_scene(out: Path) -> None:
 
 
 def _is_scene(folder: Path) -> bool:
-    """Return True for a folder with the pictures of a scene."""
     with contextlib.suppress(PolarguideError, OSError):  # two folders of one angle, or missing permissions
         return folder.is_dir() and ((folder / "polar").is_dir() or len(angle_folders(folder)) == len(ANGLES))
     return False
@@ -169,7 +168,6 @@ def select_views(layout: CaptureFiles, views: Sequence[str] | None) -> list[str]
 
 
 def _require_complete(layout: CaptureFiles, names: list[str]) -> None:
-    """Refuse views with a missing angle."""
     incomplete = [n for n in names if n not in layout.others and len(layout.pictures[n]) < len(ANGLES)]
     if not incomplete:
         return
@@ -281,8 +279,7 @@ def _numbered_folders(folders: Sequence[Path]) -> dict[int, Path]:
     sets: dict[tuple[str, str], dict[int, Path]] = {}
     for path in folders:
         for match in _NUMBER.finditer(path.name):
-            rest = path.name[: match.start()], path.name[match.end() :]
-            sets.setdefault(rest, {})[int(match[0])] = path
+            sets.setdefault((path.name[: match.start()], path.name[match.end() :]), {})[int(match[0])] = path
     complete = [by_angle for by_angle in sets.values() if set(by_angle) == set(ANGLES)]
     return complete[0] if len(complete) == 1 else {}
 
@@ -376,8 +373,13 @@ def check_memory(
     pixels = stated_pixels(layout, names)
     stored = sum((KEPT if hold else MASKS) * count // factor**2 for count in pixels)
     needed = stored + sum(READ * count for count in sorted(pixels, reverse=True)[:at_once])
-    remedy = "Use --downscale 2 or more, fewer views, or more --memory."
-    require_memory(layout.root, needed, f"{len(names)} views", limit=limit, remedy=remedy)
+    require_memory(
+        layout.root,
+        needed,
+        f"{len(names)} views",
+        limit=limit,
+        remedy="Use --downscale 2 or more, fewer views, or more --memory.",
+    )
 
 
 def require_memory_of_each(paths: Sequence[Path], pixel: int, what: str, *, remedy: str) -> None:

@@ -15,8 +15,7 @@ from torch import Tensor
 
 from polarguide.capture import box_filter as boxes
 from polarguide.capture.calibration import Calibration, Sense, combined
-from polarguide.capture.formats.arrays import decode_arrays
-from polarguide.capture.formats.pictures import MOST_MATERIAL
+from polarguide.capture.formats.pictures import MOST_MATERIAL, decode_arrays
 from polarguide.core.errors import PolarguideError, require, unknown_view
 from polarguide.core.records import decode
 from polarguide.core.text import canonical
@@ -396,13 +395,13 @@ def read_ground_truth(path: Path, data: bytes, *, size: tuple[int, int], factor:
 def _check_truth(path: Path, name: str, array: NDArray[Any], size: tuple[int, int]) -> None:
     """Refuse an array of another size or type, or with impossible values."""
     shape = (*size, _CHANNELS[name]) if _CHANNELS[name] else size
-    if array.shape != shape or array.dtype.kind not in "biuf":
-        raise PolarguideError(
-            f"{path} ({name})",
-            expected=f"an array of shape {list(shape)} like the pictures",
-            found=f"{array.dtype} of shape {list(array.shape)}",
-            remedy="Write the ground truth at the size of the pictures.",
-        )
+    require(
+        array.shape == shape and array.dtype.kind in "biuf",
+        f"{path} ({name})",
+        expected=f"an array of shape {list(shape)} like the pictures",
+        found=f"{array.dtype} of shape {list(array.shape)}",
+        remedy="Write the ground truth at the size of the pictures.",
+    )
     if name == "objid" and (
         array.dtype.kind not in "iu" or not 0 <= array.min() <= array.max() <= LARGEST_ID
     ):
@@ -425,10 +424,10 @@ def _check_truth(path: Path, name: str, array: NDArray[Any], size: tuple[int, in
         return
     most = min(_LARGEST_TRUTH, float(np.finfo(array.dtype).max))
     broken = array.size - int(np.count_nonzero(np.abs(array) <= most))  # NaN compares False
-    if broken:
-        raise PolarguideError(
-            f"{path} ({name})",
-            expected=f"finite numbers up to {_LARGEST_TRUTH:g}",
-            found=f"{broken} of {array.size} values that are NaN, infinite or larger",
-            remedy="Write 0 for unknown or too large values, and set these pixels of the mask to 0.",
-        )
+    require(
+        not broken,
+        f"{path} ({name})",
+        expected=f"finite numbers up to {_LARGEST_TRUTH:g}",
+        found=f"{broken} of {array.size} values that are NaN, infinite or larger",
+        remedy="Write 0 for unknown or too large values, and set these pixels of the mask to 0.",
+    )

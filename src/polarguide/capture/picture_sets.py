@@ -6,7 +6,7 @@ The other pictures of the view predict each picture. A large residual shows a wr
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -144,8 +144,9 @@ class _Prediction(AngleEstimate):
         residual: root mean square of the differences.
     """
 
-    gain: float
-    residual: float
+    floor: float = SetLimits.marks
+    gain: float = 1.0
+    residual: float = 0.0
 
 
 def chosen_pixels(samples: SetSamples) -> tuple[NDArray[Any], NDArray[Any]]:
@@ -216,9 +217,8 @@ def _contradicts(samples: SetSamples, gray: Floats, used: Mask, worst: int, pred
     others = _predictions(samples, gray, rest, rest).values()
     typical = float(np.median([abs(other.off) for other in others]))
     residual = float(np.median([other.residual for other in others]))
-    return (
-        predicted.contradicts(SetLimits.marks, typical) or predicted.residual > SetLimits.against * residual
-    )
+    contradicts = replace(predicted, usual=typical).contradicts
+    return contradicts or predicted.residual > SetLimits.against * residual
 
 
 def _reason(samples: SetSamples, k: int, predicted: _Prediction) -> str:
@@ -253,7 +253,7 @@ def _predict(rows: Floats, gray: Floats, others: Mask, k: int, stated: float) ->
     to determine an angle.
     """
     if not gray.shape[1]:  # a picture is saturated at every pixel
-        return _Prediction(None, math.inf, stated, 1.0, 0.0)
+        return _Prediction(None, math.inf, stated)
     inverse = np.linalg.pinv(rows[others])
     stokes = inverse @ gray[others]
     picture = gray[k]
@@ -281,7 +281,7 @@ def _predict(rows: Floats, gray: Floats, others: Mask, k: int, stated: float) ->
     if certain:
         error = math.degrees(math.sqrt(noise * (1 + leverage) / (pixels * spread)) / float(gain[best]))
     angle = float(angles[best]) if error < SetLimits.determined else None
-    return _Prediction(angle, error, stated, float(gain[best]), residual)
+    return _Prediction(angle, error, stated, gain=float(gain[best]), residual=residual)
 
 
 def typical_variance(squares: Floats, freedom: int) -> float:

@@ -14,7 +14,6 @@ from scipy.sparse.csgraph import connected_components
 
 from polarguide.capture.colmap.model import ColmapModel, fit_camera
 from polarguide.capture.formats.pictures import linear_codes
-from polarguide.geometry.camera import Camera
 
 Array = NDArray[np.floating[Any]]
 FEWEST = 20
@@ -107,7 +106,7 @@ def exposures_of_points(values: Array, places: Array) -> PointExposures:
     count, channels = values.shape[1:]
     unknown = np.full((count, channels), np.nan)
     errors = np.full((2, count), np.inf)
-    valid = _measured(values)
+    valid = np.all(np.isfinite(values), axis=-1)
     chosen_points = np.argsort(-valid.sum(axis=1), kind="stable")[:MOST_POINTS]
     chosen_points = chosen_points[valid[chosen_points].sum(axis=1) >= min(_LEAST_TRACK, count)]
     values = values[chosen_points]
@@ -128,11 +127,6 @@ def exposures_of_points(values: Array, places: Array) -> PointExposures:
     return PointExposures(logs, errors[0], errors[1], numbers)
 
 
-def _measured(values: Array) -> NDArray[np.bool_]:
-    """Return a mask of values [..., C] that are finite in all channels."""
-    return np.asarray(np.isfinite(values).all(axis=-1), np.bool_)
-
-
 def _connected(valid: NDArray[np.bool_], fewest: int) -> NDArray[np.int64]:
     """Return the indices of the largest set of pictures that shared points connect."""
     enough = np.flatnonzero(valid.sum(axis=0) >= fewest)
@@ -145,7 +139,7 @@ def _connected(valid: NDArray[np.bool_], fewest: int) -> NDArray[np.int64]:
 
 def _solve(values: Array) -> Array:
     """Return the logarithms of the exposures of connected pictures, [V, C], with mean 0."""
-    valid = _measured(values)
+    valid = np.all(np.isfinite(values), axis=-1)
     paired = valid.sum(axis=1) >= 2
     point, picture = np.nonzero(valid[paired])
     logs = np.log(values[paired][point, picture].astype(np.float64))
@@ -202,7 +196,7 @@ def _errors(values: Array, parts: NDArray[np.int64], logs: Array) -> Array:
     used = np.zeros(len(logs), np.int64)
     for part in np.unique(parts):
         members = values[parts == part]
-        valid = _measured(members)
+        valid = np.all(np.isfinite(members), axis=-1)
         chosen = _connected(valid, FEWEST // 4)
         if len(chosen) < 2:
             continue
@@ -232,40 +226,6 @@ class PointSamples:
 
     values: Array
     peaks: NDArray[Any]
-
-
-def samples_at(
-    places: Array,
-    camera: Camera,
-    pictures: Sequence[NDArray[Any]],
-    bad: NDArray[np.bool_] | None,
-    transfer: str,
-) -> PointSamples:
-    """Sample K stored pictures [H, W, 3] of one view at points.
-
-    Args:
-        places: positions of the points, [N, 3]. camera: camera at the size of the pictures.
-        pictures: stored values of the pictures.
-        bad: mask of unusable pixels, [H, W]. transfer: encoding of the pictures.
-    """
-    local = places @ camera.rotation.numpy().T + camera.translation.numpy()
-    depth = np.where(local[:, 2] > 0, local[:, 2], np.nan)
-    column = np.floor(camera.fx * local[:, 0] / depth + camera.cx)
-    row = np.floor(camera.fy * local[:, 1] / depth + camera.cy)
-    height, width = pictures[0].shape[:2]
-    inside = np.flatnonzero((column >= 1) & (column < width - 1) & (row >= 1) & (row < height - 1))
-    around = np.mgrid[-1:2, -1:2].reshape(2, 1, 9)
-    y, x = np.stack([row[inside], column[inside]]).astype(int)[..., None] + around
-    values = np.full((len(places), len(pictures), 3), np.nan)
-    peaks = np.zeros(len(places), np.int64)
-    for k, picture in enumerate(pictures):
-        patches = picture[y, x]
-        values[inside, k] = linear_codes(patches, transfer).mean(axis=1) / _FULL
-        peaks[inside] = np.maximum(peaks[inside], patches.max(axis=(1, 2)))
-    if bad is not None:
-        values[inside[bad[y, x].any(axis=1)]] = np.nan
-    values[values.mean(axis=(1, 2)) < _DARK] = np.nan
-    return PointSamples(values, peaks)
 
 
 def matte(values: Array) -> Array:
@@ -310,17 +270,34 @@ class ComparedPoints:
     def samples(
         self, view: str, raw: Sequence[NDArray[Any]], bad: NDArray[np.bool_] | None, transfer: str
     ) -> PointSamples | None:
-        """Sample a view's stored pictures at the points that it observes; None without a pose."""
+        """Sample the stored pictures of a view at the points that it observes; None without a pose.
+
+        Args:
+            view: name of the view. raw: K stored pictures, [H, W, 3].
+            bad: mask of unusable pixels, [H, W]. transfer: encoding of the pictures.
+        """
         if view not in self.columns:
             return None
         height, width = raw[0].shape[:2]
-        return samples_at(
-            self.places[self.observed[:, self.columns[view]]],
-            fit_camera(self.model.camera(view), width, height, folder=self.model.folder, view=view),
-            raw,
-            bad,
-            transfer,
-        )
+        places = self.places[self.observed[:, self.columns[view]]]
+        camera = fit_camera(self.model.camera(view), width, height, folder=self.model.folder, view=view)
+        local = places @ camera.rotation.numpy().T + camera.translation.numpy()
+        depth = np.where(local[:, 2] > 0, local[:, 2], np.nan)
+        column = np.floor(camera.fx * local[:, 0] / depth + camera.cx)
+        row = np.floor(camera.fy * local[:, 1] / depth + camera.cy)
+        inside = np.flatnonzero((column >= 1) & (column < width - 1) & (row >= 1) & (row < height - 1))
+        around = np.mgrid[-1:2, -1:2].reshape(2, 1, 9)
+        y, x = np.stack([row[inside], column[inside]]).astype(int)[..., None] + around
+        values = np.full((len(places), len(raw), 3), np.nan)
+        peaks = np.zeros(len(places), np.int64)
+        for k, picture in enumerate(raw):
+            patches = picture[y, x]
+            values[inside, k] = linear_codes(patches, transfer).mean(axis=1) / _FULL
+            peaks[inside] = np.maximum(peaks[inside], patches.max(axis=(1, 2)))
+        if bad is not None:
+            values[inside[bad[y, x].any(axis=1)]] = np.nan
+        values[values.mean(axis=(1, 2)) < _DARK] = np.nan
+        return PointSamples(values, peaks)
 
     def exposures(self, samples: Mapping[str, PointSamples | None], full_scale: int | None) -> PointExposures:
         """Estimate the exposures of views of four angles, in their order.

@@ -21,13 +21,14 @@ from msgspec import Meta
 
 from polarguide.capture.colmap.model import PosedCamera, view_of_name
 from polarguide.capture.datasets.dataset import (
+    POSE_SHAPES,
     checked_intrinsics,
     checked_pose,
     pinhole_camera,
     read_projections,
     require_known_names,
 )
-from polarguide.capture.formats.arrays import finite_numbers, require_camera, wrong_camera
+from polarguide.capture.formats.pictures import finite_numbers, require_camera, wrong_camera
 from polarguide.core.errors import PolarguideError, PolarguideWarning, require
 from polarguide.core.files import read_file
 from polarguide.core.records import LARGEST_RECORD, decode, parse
@@ -77,7 +78,6 @@ def settled_size(
     return fitting[0]
 
 
-_SQUARE = ((3, 4), (4, 4))
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 """Change of axes for cameras that look along -z with y up."""
 _PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
@@ -171,8 +171,9 @@ def read_transforms(path: Path, views: Collection[str], sizes: Sizes) -> dict[st
         # ``from_na`` of NeuS2 means axes right, down, forward.
         to_world = _pose_of(where, frame) @ (np.eye(4) if record.from_na else _OPENGL)
         cameras[view] = _camera_of(where, lens, to_world, functools.partial(sizes, view))
-    known = {*_Transforms.__struct_fields__, *_Frame.__struct_fields__, *_IRRELEVANT}
-    require_known_names(path, names - known)
+    require_known_names(
+        path, names - {*_Transforms.__struct_fields__, *_Frame.__struct_fields__, *_IRRELEVANT}
+    )
     return cameras
 
 
@@ -200,8 +201,7 @@ def _lens_of(where: str, frame: Any, record: Any) -> dict[str, Any]:
         return used
     others = [name for name in (*_FOCAL, *_MATRIX) if name != "intrinsic_matrix" and used[name] is not None]
     require_camera(not others, where, "intrinsic_matrix alone", f"also {', '.join(others)}")
-    matrix = finite_numbers(where, used["intrinsic_matrix"], ((3, 3), *_SQUARE))[:3, :3]
-    inner = checked_intrinsics(where, matrix)
+    inner = checked_intrinsics(where, used["intrinsic_matrix"])
     numbers = (inner[0, 0], inner[1, 1], inner[0, 2], inner[1, 2])
     return used | dict(zip(_MATRIX, map(float, numbers), strict=True))
 
@@ -213,7 +213,7 @@ def _pose_of(where: str, frame: _Frame) -> Any:
         for matrix in (frame.transform_matrix, frame.transform_matrix_start, frame.transform_matrix_end)
         if matrix is not None
     ]
-    numbers = [finite_numbers(where, matrix, _SQUARE)[:3] for matrix in matrices or [[]]]
+    numbers = [finite_numbers(where, matrix, POSE_SHAPES)[:3] for matrix in matrices or [[]]]
     require_camera(
         all(np.allclose(numbers[0], other) for other in numbers[1:]),
         where,
@@ -226,7 +226,6 @@ def _pose_of(where: str, frame: _Frame) -> Any:
 def _camera_of(
     where: str, lens: Mapping[str, Any], to_world: Any, sizes: Callable[[], Sequence[Size]]
 ) -> PosedCamera:
-    """Create the camera of a frame."""
     fisheye = _is_fisheye(where, lens)
     coefficients = _distortion(where, lens, fisheye)
     center = (lens["cx"], lens["cy"])
@@ -237,8 +236,12 @@ def _camera_of(
     focal = _focal_lengths(where, lens, size, fisheye)
     middle = [size[k] / 2 if center[k] is None else float(center[k]) for k in range(2)]
     inner = (*focal, *middle)
-    lens_model = (_FISHEYE, (*inner, *coefficients)) if fisheye else brown_camera(inner, coefficients)
-    return camera_to_world(where, size, lens_model, to_world)
+    return camera_to_world(
+        where,
+        size,
+        (_FISHEYE, (*inner, *coefficients)) if fisheye else brown_camera(inner, coefficients),
+        to_world,
+    )
 
 
 def _is_fisheye(where: str, lens: Mapping[str, Any]) -> bool:
@@ -560,7 +563,6 @@ def read_metashape(path: Path, views: Collection[str]) -> dict[str, PosedCamera]
 
 
 def _warn(path: Path, text: str) -> None:
-    """Warn about a feature of a pose file."""
     warnings.warn(f"{path.name} has {text}.", PolarguideWarning, stacklevel=3)
 
 
@@ -640,8 +642,7 @@ def _metashape_lens(where: str, sensor: Any) -> tuple[tuple[int, int], tuple[str
         PolarguideError: the type of the lens is unsupported, or COLMAP's model lacks one of its terms.
     """
     calibrations = sensor.findall("calibration")
-    adjusted = [c for c in calibrations if c.get("class") == "adjusted"]
-    best = next(iter(adjusted or calibrations), None)
+    best = next(iter([c for c in calibrations if c.get("class") == "adjusted"] or calibrations), None)
     kinds = {sensor.get("type", "frame"), *([] if best is None else [best.get("type", "frame")])}
     fisheye = kinds <= set(_EQUIDISTANT)
     require_camera(

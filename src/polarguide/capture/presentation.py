@@ -70,7 +70,6 @@ class Crop(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_default
         _check_direction("crop.up", self.up)
 
     def _frame(self, around: SceneFrame) -> SceneFrame:
-        """Return the frame of the box."""
         return around if self.up is None else _upright(around, self.up)
 
     def corners(self, around: SceneFrame) -> Tensor:
@@ -219,13 +218,11 @@ def _specified_fields(presentation: Presentation) -> Mapping[str, Any]:
 
 
 def _upright(around: SceneFrame, up: Vector) -> SceneFrame:
-    """Return a frame with another up axis."""
     axis = torch.tensor(up, dtype=torch.float64)
     return replace(around, up=axis / axis.norm())
 
 
 def _check_direction(name: str, vector: Vector | None) -> None:
-    """Refuse a vector without a direction."""
     if vector is not None and not (all(map(math.isfinite, vector)) and 1e-9 < math.hypot(*vector) < 1e9):
         raise PolarguideError(
             name, expected="a direction, three numbers not all 0", found=str(list(vector)), remedy=REMEDY

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 import os
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -115,13 +116,9 @@ def held_out_band(cameras: Mapping[str, Camera], tests: Sequence[str]) -> list[s
             rings[-1].append(k)
         else:
             rings.append([k])
-    bands: list[list[str]] = [[]]
-    for ring in rings:
-        if all(names[k] in tests for k in ring):
-            bands[-1] += [names[k] for k in ring]
-        else:
-            bands.append([])
-    longest = max(bands, key=len)
+    runs = itertools.groupby(rings, lambda ring: all(names[k] in tests for k in ring))
+    bands = [[names[k] for ring in run for k in ring] for is_held_out, run in runs if is_held_out]
+    longest = max(bands, key=len, default=[])
     enough = len(longest) >= FEWEST_IN_BAND and 2 * len(longest) >= len(tests) and len(tests) < len(names)
     return sorted(longest) if enough else []
 
@@ -409,8 +406,11 @@ def _points_of(
 ) -> tuple[NDArray[Any], NDArray[Any]]:
     """Return points [M, 3] float32 and their colors [M, 3] uint8, by default gray."""
     places = _rows(points, "points", np.float32)
-    colors = np.full(places.shape, 128, np.uint8) if point_colors is None else point_colors
-    shades = _rows(colors, "point_colors", np.uint8)
+    shades = _rows(
+        np.full(places.shape, 128, np.uint8) if point_colors is None else point_colors,
+        "point_colors",
+        np.uint8,
+    )
     _require_array(
         len(shades) == len(places), "point_colors", f"{len(places)} rows, one per point", str(len(shades))
     )
@@ -439,7 +439,6 @@ def _require_array(condition: object, where: str, expected: str, found: str) -> 
 def _digest(
     data: Sequence[ViewData], cameras: Mapping[str, Camera], more: Sequence[NDArray[Any]], how: object
 ) -> str:
-    """Return the SHA-256 of all inputs of a scene."""
     digest = hashlib.sha256(repr(how).encode())
     for item in data:
         camera = cameras[item.name]
@@ -516,8 +515,9 @@ def load_scene(
             fit_camera(camera, *size, folder=model.folder, view=name)
     check_memory(layout, names, factor=downscale, at_once=_THREADS, limit=memory, hold=hold)
 
-    how = {"downscale": downscale, "transfer": transfer, "hold": hold, "reporter": reporter}
-    stored = read_views(layout, names, model, **how)  # type: ignore[arg-type]
+    stored = read_views(
+        layout, names, model, downscale=downscale, transfer=transfer, hold=hold, reporter=reporter
+    )
     for item in stored.data:
         files.digests.update(item.digests)
     without_pixels = [item.name for item in stored.data if item.invalid.all()]
@@ -651,8 +651,11 @@ def _without_pictures(data: ViewData) -> ViewData:
     """Reduce a view to the part that stays in memory if its pictures are loaded from files."""
     truth = data.ground_truth
     has_objects = truth is not None and truth.object_ids is not None
-    stub = GroundTruth(object_ids=torch.empty(0)) if has_objects else None
-    return replace(data, codes=checks.sampled(data.codes), ground_truth=stub)
+    return replace(
+        data,
+        codes=checks.sampled(data.codes),
+        ground_truth=GroundTruth(object_ids=torch.empty(0)) if has_objects else None,
+    )
 
 
 def _content_warnings(layout: CaptureFiles, stored: StoredViews, invalid: list[str]) -> list[str]:

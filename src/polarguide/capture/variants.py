@@ -19,7 +19,7 @@ from polarguide.capture.box_filter import agreed, every, maximum, mean_codes
 from polarguide.capture.exposures import FOUR, PLAIN, Exposure
 from polarguide.capture.scene import Scene
 from polarguide.capture.view import EVEN, FULL_CODE, Latest, Loader, View
-from polarguide.core.errors import PolarguideError, require
+from polarguide.core.errors import require
 from polarguide.core.options import EXPOSURES, Exposures, check_choice
 from polarguide.geometry.camera import seen_at
 from polarguide.geometry.polarizer import ANGLES
@@ -47,8 +47,7 @@ def black_pixels(view: View) -> Tensor:
 
 def has_black_background(views: Sequence[View]) -> bool:
     """Return True if nearly all pictures have a black edge, see ``BLACK_EDGE``."""
-    black = sum(_black_edge(view) for view in views)
-    return bool(views) and black >= BLACK_VIEWS * len(views)
+    return bool(views) and sum(_black_edge(view) for view in views) >= BLACK_VIEWS * len(views)
 
 
 def empty_pixels(view: View) -> Tensor:
@@ -74,13 +73,13 @@ def mask_background(scene: Scene) -> Scene:
     """
     views = []
     for view in scene.views:
-        if view.mask is None:
-            raise PolarguideError(
-                scene.root / "masks",
-                expected="a mask of every view for --background masked",
-                found=f"no mask for view {view.name}",
-                remedy=f"Add masks/{view.name}.png, white where the subject is, or choose another background.",
-            )
+        require(
+            view.mask is not None,
+            scene.root / "masks",
+            expected="a mask of every view for --background masked",
+            found=f"no mask for view {view.name}",
+            remedy=f"Add masks/{view.name}.png, white where the subject is, or choose another background.",
+        )
         views.append(view.masked())
     # Training must not use the masks of held-out views.
     inside = _in_masks(scene.points, [view for view in views if view.name not in scene.test_names])
@@ -110,7 +109,6 @@ def _in_masks(points: Tensor, views: Sequence[View]) -> Tensor:
 
 
 def _black(view: View) -> NDArray[np.bool_]:
-    """Return a mask of black or invalid pixels, [H, W]."""
     return (black_pixels(view) | view.invalid.cpu()).numpy()
 
 
@@ -122,7 +120,6 @@ def _black_edge(view: View) -> bool:
 
 
 def _grown(mask: NDArray[np.bool_], pixels: int) -> NDArray[np.bool_]:
-    """Dilate a mask by a disk."""
     disk = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * pixels + 1, 2 * pixels + 1))
     return np.asarray(cv2.dilate(mask.astype(np.uint8), disk) > 0)
 
@@ -167,13 +164,11 @@ def select_exposures(scene: Scene, exposures: Exposures) -> Scene:
 
 
 def _some(view: View, *places: int, known: bool = True) -> View:
-    """Return a view with some of its four pictures."""
     chosen = tuple(FOUR[place] if known else Exposure() for place in places)
     return view.changed(lambda codes: torch.stack([codes[place] for place in places]), chosen)
 
 
 def _computed(view: View, pictures: Callable[[View], list[Tensor]], exposures: tuple[Exposure, ...]) -> View:
-    """Return a view with computed pictures."""
 
     def change(codes: Tensor) -> Tensor:
         new = torch.stack(pictures(replace(view, pictures=codes, gains=EVEN))).clamp(0, 1) * FULL_CODE
@@ -198,7 +193,6 @@ def _three(view: View, _place: int) -> View:
 
 
 def _plain(view: View, _place: int) -> View:
-    """Return a view with S0/2 as its only picture."""
     return _computed(view, lambda view: [view.photograph()], PLAIN)
 
 
@@ -279,5 +273,8 @@ def smaller(scene: Scene, longest: int) -> Scene:
     if factor == 1:
         return scene
     small = (smaller_view(view, factor, Latest()) for view in views)
-    stored = (replace(view, pictures=view.codes, mask=None, subject_only=False) for view in small)
-    return replace(scene, views=tuple(stored), test_names=())
+    return replace(
+        scene,
+        views=tuple(replace(view, pictures=view.codes, mask=None, subject_only=False) for view in small),
+        test_names=(),
+    )

@@ -268,8 +268,9 @@ class View:
         if not self.is_determined:
             raise self.undetermined("a Stokes vector")
         places = [k for k, exposure in enumerate(self.exposures) if exposure.known]
-        rays = self.camera.rays(device=self.device)
-        rows = analyzers([self.exposures[k] for k in places], rays, self.mount)
+        rows = analyzers(
+            [self.exposures[k] for k in places], self.camera.rays(device=self.device), self.mount
+        )
         return optics.fitted_stokes(self.intensities()[places], rows)
 
     def photograph(self) -> Tensor:

@@ -74,7 +74,14 @@ def stored_pictures(pictures: Array, where: str) -> NDArray[Any]:
     if values.ndim == 3:
         values = values[..., None]
     if np.issubdtype(values.dtype, np.floating):
-        values = codes_of_floats(values, where)
+        require(
+            values.min() >= 0 and values.max() <= 1,
+            where,
+            expected="floats from 0 to 1, linear, 1 at full scale",
+            found=f"{values.min():g} to {values.max():g}",
+            remedy="Divide by the value at full scale, and clip negative noise to 0.",
+        )
+        values = np.rint(values.astype(np.float64) * FULL_CODE).astype(np.uint16)
     elif values.dtype not in (np.uint8, np.uint16):
         raise PolarguideError(
             where,
@@ -83,24 +90,6 @@ def stored_pictures(pictures: Array, where: str) -> NDArray[Any]:
             remedy="Convert them, for example astype(np.uint16).",
         )
     return np.repeat(values, 3, axis=3) if values.shape[3] == 1 else values
-
-
-def codes_of_floats(values: NDArray[Any], where: str) -> NDArray[np.uint16]:
-    """Convert linear floats, 1 at full scale, to 16-bit codes.
-
-    Raises:
-        PolarguideError: a value is outside 0 to 1, or not a number.
-    """
-    low = float(values.min())
-    high = float(values.max())
-    require(
-        low >= 0 and high <= 1,
-        where,
-        expected="floats from 0 to 1, linear, 1 at full scale",
-        found=f"{low:g} to {high:g}",
-        remedy="Divide by the value at full scale, and clip negative noise to 0.",
-    )
-    return np.rint(values.astype(np.float64) * FULL_CODE).astype(np.uint16)
 
 
 def exposures_of(angles: Sequence[Angle], count: int, where: str) -> tuple[Exposure, ...]:
@@ -317,12 +306,16 @@ class ViewFiles:
         return None if path is None else Loader(functools.partial(self._read_truth, path, size), self._truths)
 
     def _read_codes(self, name: str) -> Tensor:
-        raw = _read_pictures(Files(self._digests), self._layout.files(name))
-        return torch.from_numpy(_codes(raw, self._transfer, self._factor))
+        return torch.from_numpy(
+            _codes(
+                _read_pictures(Files(self._digests), self._layout.files(name)), self._transfer, self._factor
+            )
+        )
 
     def _read_truth(self, path: Path, size: tuple[int, int]) -> GroundTruth | None:
-        data = Files(self._digests).read(path)
-        return read_ground_truth(path, data, size=(size[1], size[0]), factor=self._factor)
+        return read_ground_truth(
+            path, Files(self._digests).read(path), size=(size[1], size[0]), factor=self._factor
+        )
 
 
 def _compact(mask: Tensor) -> Tensor:
@@ -583,8 +576,9 @@ class StoredViews:
             checks.measure(item.codes, ~(item.invalid | item.saturated(scale)), four=item.exposures == FOUR)
             for item in data
         ]
-        samples = {item.name: item.samples for item in data}
-        exposures = None if points is None else points.exposures(samples, scale)
+        exposures = (
+            None if points is None else points.exposures({item.name: item.samples for item in data}, scale)
+        )
         return cls(tuple(data), tuple(cameras), tuple(measures), largest_value, scale, exposures)
 
     def picture_warnings(self, transfer: str) -> list[str]:
@@ -592,6 +586,7 @@ class StoredViews:
         names = [item.name for item in self.data]
         scale = self.full_scale
         blown = [0.0 if scale is None else float((item.peak >= scale).mean()) for item in self.data]
-        largest = max(int(item.peak.max()) for item in self.data)
-        warnings = checks.exposure_warnings(names, self.measures, blown, largest, self.largest_value)
+        warnings = checks.exposure_warnings(
+            names, self.measures, blown, max(int(item.peak.max()) for item in self.data), self.largest_value
+        )
         return warnings + checks.polarization_warnings(names, self.measures, transfer)

@@ -16,26 +16,26 @@ from polarguide.capture.exposures import Angle, angle_labels
 from polarguide.capture.view import ANGLES, FULL_CODE
 from polarguide.core.files import make_folder, write_whole
 
-# Of PNG: the second is better for few values, as those of JPEGs that nothing resampled. libpng's own choice for each
-# row makes files no smaller, as low bits that hold nothing mislead its estimate, and slower to read.
+# Filters of PNG. The second is better for few values, such as those of JPEG files without resampling. libpng's adaptive
+# choice makes files no smaller, because unused low bits mislead its estimate, and slower to read.
 _FILTERS = (cv2.IMWRITE_PNG_FILTER_SUB, cv2.IMWRITE_PNG_FILTER_NONE)
-_TRIED_ROWS = 64
+_SAMPLE_ROWS = 64
 _LEVEL = 6
 Rounding = Sequence[tuple[int, int]]
-"""Codes from the first number of a pair on, up to the next pair's, are multiples of its second number."""
+"""Pairs of the first code of a range and the step to which codes of this range are rounded."""
 EXACT: Rounding = ((0, 1),)
 
 
 def rounding_of(values: NDArray[np.floating[Any]]) -> list[tuple[int, int]]:
-    """Rounding of codes: the power of two nearest to a quarter of the camera's step there, at least 1.
+    """Choose steps of codes: the power of two nearest to a quarter of the camera's step, at least 1.
 
-    Rounding changes a value by less than a fifth of the step, the camera's own rounding by half of it. Files shrink,
-    because their last bits then hold nothing.
+    The error is less than a fifth of the camera's step, whose own rounding error is half a step. Files shrink, because
+    low bits are unused.
 
     Args:
-        values: [N] the values that the camera has around there, ascending, as 16-bit codes; at least two.
+        values: the camera's values as 16-bit codes, ascending, [N] with N > 1.
     """
-    # Where steps grow with the values, as those of sRGB do, none is taken for larger than those above it.
+    # Steps may grow with the values, as in sRGB. A step is at most as large as the next ones.
     steps = np.minimum.accumulate(np.diff(values)[::-1])[::-1]
     multiples = np.exp2(np.round(np.log2(np.maximum(steps / 4, 1)))).astype(int)
     changes = np.flatnonzero(np.diff(multiples, prepend=0))
@@ -47,9 +47,9 @@ def rounding_of(values: NDArray[np.floating[Any]]) -> list[tuple[int, int]]:
 def intensity_codes(
     intensities: NDArray[np.float32], invalid: NDArray[np.bool_], rounding: Rounding = EXACT
 ) -> NDArray[np.uint16]:
-    """Linear intensities [K, H, W, 3] in [0, 1] as 16-bit codes, rounded, but for the largest.
+    """Convert linear intensities [K, H, W, 3] in [0, 1] to 16-bit codes with rounding.
 
-    Only invalid pixels [H, W] may have the largest code, because readers take it for saturation.
+    Only invalid pixels [H, W] may have the largest code, because readers interpret it as saturation.
     """
     values = np.clip(intensities, 0.0, 1.0) * np.float32(FULL_CODE)
     multiples: Any = np.float32(rounding[0][1])
@@ -63,12 +63,12 @@ def intensity_codes(
 
 
 def picture_name(view: str, angle: int) -> str:
-    """The path of a view's picture in its scene folder."""
+    """Return the path of a view's picture in its scene folder."""
     return f"polar/{view}_{angle:03d}.png"
 
 
 def picture_names(view: str, angles: Sequence[Angle] = ANGLES) -> list[str]:
-    """The paths of a view's pictures at any angles in its scene folder."""
+    """Return the paths of a view's pictures in its scene folder."""
     return [f"polar/{view}_{label}.png" for label in angle_labels(angles)]
 
 
@@ -83,16 +83,16 @@ def write_view(
     """Write the pictures of a view.
 
     Args:
-        root: the scene folder.
+        root: scene folder.
         view: name of the view.
-        codes: linear 16-bit codes at ``angles``, [K, H, W, 3] RGB. Where the channels are equal, as
-            those of a monochrome sensor are, one is written.
-        invalid: unusable pixels, [H, W].
-        mask: object mask, [H, W].
-        angles: angles of the pictures, where there are others than four.
+        codes: linear 16-bit codes at ``angles``, [K, H, W, 3] RGB. Equal channels, such as those of a gray sensor,
+            are written as one.
+        invalid: mask of unusable pixels, [H, W].
+        mask: foreground mask, [H, W].
+        angles: angles of the pictures.
 
     Returns:
-        The size in bytes of each file that was written, by its path in the scene folder.
+        Size of each file in bytes by its path in the scene folder.
 
     Raises:
         PolarguideError: a file cannot be written.
@@ -103,16 +103,18 @@ def write_view(
     for folder, pixels in (("invalid", invalid), ("masks", mask)):
         if pixels is not None:
             files[f"{folder}/{view}.png"] = pixels.astype(np.uint8) * 255
-    with ThreadPoolExecutor(min(len(files), os.cpu_count() or 1)) as pool:  # compression takes longest
+    with ThreadPoolExecutor(
+        min(len(files), os.cpu_count() or 1)
+    ) as pool:  # compression takes most of the time
         encoded = list(pool.map(_png_data, (root / name for name in files), files.values()))
     return {name: _write(root / name, data) for name, data in zip(files, encoded, strict=True)}
 
 
-def write_png(path: Path, pixels: NDArray[Any]) -> int:
-    """Write a PNG file, and its folder if it is missing; returns the size in bytes.
+def write_png_file(path: Path, pixels: NDArray[Any]) -> int:
+    """Write a PNG file, create its folder if necessary, and return the size in bytes.
 
     Args:
-        path: the file.
+        path: path of the file.
         pixels: gray [H, W] or RGB [H, W, 3], uint8 or uint16.
 
     Raises:
@@ -123,15 +125,18 @@ def write_png(path: Path, pixels: NDArray[Any]) -> int:
 
 def _png_data(path: Path, pixels: NDArray[Any]) -> bytes:
     stored = np.ascontiguousarray(pixels[..., ::-1] if pixels.ndim == 3 else pixels)
-    first = max(0, (len(stored) - _TRIED_ROWS) // 2)
-    tried = stored[first : first + _TRIED_ROWS]
-    return _encoded(path, stored, min(_FILTERS, key=lambda way: len(_encoded(path, tried, way))))
+    first = max(0, (len(stored) - _SAMPLE_ROWS) // 2)
+    sample = stored[first : first + _SAMPLE_ROWS]
+    return _encoded(
+        path, stored, min(_FILTERS, key=lambda png_filter: len(_encoded(path, sample, png_filter)))
+    )
 
 
-def _encoded(path: Path, stored: NDArray[Any], way: int) -> bytes:
-    options = (cv2.IMWRITE_PNG_FILTER, way, cv2.IMWRITE_PNG_COMPRESSION, _LEVEL)
-    done, data = cv2.imencode(".png", stored, options)
-    if not done:
+def _encoded(path: Path, stored: NDArray[Any], png_filter: int) -> bytes:
+    success, data = cv2.imencode(
+        ".png", stored, (cv2.IMWRITE_PNG_FILTER, png_filter, cv2.IMWRITE_PNG_COMPRESSION, _LEVEL)
+    )
+    if not success:
         raise OSError(f"{path}: the picture cannot be encoded")
     return data.tobytes()
 

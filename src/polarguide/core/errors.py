@@ -1,4 +1,4 @@
-"""The one exception that means: the user's input or environment is at fault, and what to do about it."""
+"""Errors in the user's input or environment, with a remedy."""
 
 from __future__ import annotations
 
@@ -17,32 +17,32 @@ from typing import Any, NamedTuple
 
 
 class PolarguideError(Exception):
-    """A mistake in what was given to the program.
+    """Error in input.
 
-    The message names the file or field, what was expected, what was found, and what to do. The command line
-    prints it as one line without a traceback.
+    The message names the file or field, the expected and the actual value, and a remedy. The command line prints it as
+    one line without a traceback.
 
     Args:
-        where: the file, folder, flag or field.
-        expected: what should have been there.
-        found: what was there.
-        remedy: what to do about it.
+        where: file, folder, option or field.
+        expected: valid value, a noun phrase.
+        found: actual value.
+        remedy: how to correct the error, an imperative sentence.
     """
 
     def __init__(self, where: object, *, expected: str, found: str, remedy: str) -> None:
         super().__init__(f"{where}: expected {expected}, found {found}. {remedy}")
         self.where = str(where)
-        self.is_path = isinstance(where, os.PathLike)  # one may be called like an option
+        self.is_path = isinstance(where, os.PathLike)  # its name can look like an option
         self.expected = expected
         self.found = found
         self.remedy = remedy
 
 
 def require(condition: object, where: object, *, expected: str, found: str, remedy: str) -> None:
-    """Check a condition on what was given to the program.
+    """Check a condition on input.
 
     Args:
-        condition: its truth value counts. where, expected, found, remedy: as for ``PolarguideError``.
+        condition: the condition. where, expected, found, remedy: as for ``PolarguideError``.
 
     Raises:
         PolarguideError: the condition does not hold.
@@ -52,7 +52,7 @@ def require(condition: object, where: object, *, expected: str, found: str, reme
 
 
 def unknown_view(where: object, name: str, names: Sequence[str]) -> PolarguideError:
-    """The error that ``name`` is not among the view names, with those nearest to it."""
+    """Return the error for an unknown view name, with the most similar names."""
     near = difflib.get_close_matches(name, names, n=3, cutoff=0.4) or names[:3]
     return PolarguideError(
         where,
@@ -63,26 +63,26 @@ def unknown_view(where: object, name: str, names: Sequence[str]) -> PolarguideEr
 
 
 class PolarguideWarning(UserWarning):
-    """Something that the user should know before relying on a result."""
+    """Warning about the reliability of a result."""
 
 
 DISTRIBUTIONS = {"pxr": "usd-core", "skimage": "scikit-image", "websockets": "viser"}
-"""What to install for a module of another name: viser works with some versions of websockets only, and brings one."""
+"""Distributions of modules with another name. viser needs a certain version of websockets and installs it."""
 _NAME = re.compile(r"[A-Za-z0-9._-]+")
 _EXTRA = re.compile(r"""extra\s*==\s*["']([^"']+)["']""")
 
 
 def install_extra(extra: str) -> str:
-    """The command that adds the packages of an extra.
+    """Return the command that installs the packages of an extra.
 
-    It names them, and not the extra: from a source folder that would compile polarguide once more.
+    It names the packages instead of the extra, which would compile polarguide again in a source folder.
     """
     packages = [requirement.text for requirement in requirements() if requirement.extra == extra]
     return _pip(*(packages or [f"polarguide[{extra}]"]))
 
 
 def install_package(module: str) -> str:
-    """The command that adds the package of a module, in a version that polarguide works with."""
+    """Return the command that installs the package of a module in a supported version."""
     module = module.partition(".")[0]
     package = _plain(DISTRIBUTIONS.get(module, module))
     specified = (requirement.text for requirement in requirements() if _plain(requirement.name) == package)
@@ -90,23 +90,24 @@ def install_package(module: str) -> str:
 
 
 def _plain(name: str) -> str:
-    """The name of a distribution as indexes compare it."""
+    """Return the normalized name of a distribution."""
     return re.sub(r"[-_.]+", "-", name).lower()
 
 
 def _pip(*packages: str) -> str:
-    """A command line of the pip that installs where this program runs: not always the one on the shell's path."""
+    """Return the command line of the pip of this Python, which can differ from the pip in the shell's path."""
     executable = shutil.which("pip")
     ours = executable is not None and Path(executable).parent == Path(sys.executable).parent
     return shlex.join([*(["pip"] if ours else [sys.executable, "-m", "pip"]), "install", *packages])
 
 
 class Requirement(NamedTuple):
-    """A distribution that polarguide's installed metadata asks for.
+    """Requirement in polarguide's installed metadata.
 
     Attributes:
-        name: of the distribution. text: with its versions, such as ``viser==1.1.*``. extra: which one brings it; empty:
-            it comes with polarguide. conditional: only on some systems or versions of Python.
+        name: name of the distribution. text: name and versions, such as ``viser==1.1.*``.
+        extra: extra that includes it; empty: polarguide always requires it.
+        conditional: True if only some systems or versions of Python require it.
     """
 
     name: str
@@ -116,7 +117,7 @@ class Requirement(NamedTuple):
 
 
 def requirements() -> list[Requirement]:
-    """Requirements in the installed metadata; [] where polarguide runs without being installed."""
+    """Return the requirements in the installed metadata; [] if polarguide is not installed."""
     metadata = importlib.import_module("importlib.metadata")
     try:
         lines = metadata.requires("polarguide") or []
@@ -133,26 +134,26 @@ def requirements() -> list[Requirement]:
 
 
 def require_package(module: str, what: str) -> None:
-    """Check that a package is there, without loading it: before work begins, not after. See ``optional_import``.
+    """Check that a package is installed before work begins, without importing it; see ``optional_import``.
 
     Raises:
         PolarguideError: the package is not installed.
     """
     try:
-        there = importlib.util.find_spec(module) is not None
-    except (ImportError, ValueError):  # a package whose own metadata is broken
-        there = False
-    if not there:
+        is_installed = importlib.util.find_spec(module) is not None
+    except (ImportError, ValueError):  # broken metadata of the package
+        is_installed = False
+    if not is_installed:
         raise _missing(module, what)
 
 
 def optional_import(module: str, what: str) -> Any:
-    """Import a library that most verbs do without: then it costs them no time, and may be missing.
+    """Import a library that few verbs need, and that may be missing.
 
-    Ctrl-C does what it did: dask_jobqueue, for one, would make every later one end the process at once.
+    The handler of Ctrl-C is restored, because libraries such as dask_jobqueue replace it.
 
     Args:
-        module: its name. what: what it is needed for, as the message says.
+        module: name of the module. what: verb or option that needs it, for the message.
 
     Raises:
         PolarguideError: the package is not installed.
@@ -167,14 +168,24 @@ def optional_import(module: str, what: str) -> Any:
             signal.signal(signal.SIGINT, before)
 
 
+def _missing(module: str, what: str) -> PolarguideError:
+    """Return the error for a missing package."""
+    return PolarguideError(
+        what,
+        expected=f"the Python package {module.partition('.')[0]}",
+        found="package not installed",
+        remedy=f"Install it with {install_package(module)} and repeat the command.",
+    )
+
+
 def import_part(module: str, what: str) -> Any:
-    """Import a module of this package or of a neighbor, which is part of the same distribution.
+    """Import a module of this package or of another package of the same distribution.
 
     Args:
-        module: its full name, such as "polarguide_shots.verbs". what: the verb or name that needs it, for the message.
+        module: full name, such as "polarguide_shots.verbs". what: verb or name that needs it, for the message.
 
     Raises:
-        PolarguideError: the neighbor is not installed.
+        PolarguideError: the package is not installed.
     """
     package = module.partition(".")[0]
     try:
@@ -185,15 +196,6 @@ def import_part(module: str, what: str) -> Any:
         raise PolarguideError(
             what,
             expected=f"the package {package}, a part of polarguide",
-            found="that it is not installed",
+            found="package not installed",
             remedy="Install polarguide again.",
         ) from None
-
-
-def _missing(module: str, what: str) -> PolarguideError:
-    return PolarguideError(
-        what,
-        expected=f"the Python package {module.partition('.')[0]}",
-        found="that it is not installed",
-        remedy=f"Install it with {install_package(module)} and repeat the command.",
-    )

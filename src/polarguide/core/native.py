@@ -1,5 +1,6 @@
-"""Tensors that the native passes accept, and calls of native functions. Other tensors use the reference
-implementations.
+"""Tensors that the native passes accept, and calls of native functions.
+
+Other tensors use the reference implementations.
 """
 
 from __future__ import annotations

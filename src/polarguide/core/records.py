@@ -49,8 +49,7 @@ def read_record(path: Path, kind: type[T], *, remedy: str = CORRECT) -> T:
 def decode(data: bytes | Any, kind: type[T], where: object, *, remedy: str = CORRECT) -> T:
     """Convert JSON to a record.
 
-    Numbers must be finite, Booleans are not numbers, and keys must be unique. Unknown keys are ignored unless the
-    type
+    Numbers must be finite, Booleans are not numbers, and keys must be unique. Unknown keys are ignored unless the type
     forbids them.
 
     Args:
@@ -108,9 +107,7 @@ def _each_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     record = dict(pairs)
     if len(record) < len(pairs):
         keys = [key for key, _ in pairs]
-        raise ValueError(
-            f"{shortened(next(key for key in record if keys.count(key) > 1))} stands there twice"
-        )
+        raise ValueError(f"{shortened(next(key for key in record if keys.count(key) > 1))} occurs twice")
     return record
 
 

@@ -24,7 +24,7 @@ from polarguide.core.options import MOST_THREADS
 MEBIBYTE = 1 << 20
 LAST_WORDS_SECONDS = 5.0
 MOST_PROCESSES = 65536
-# of glibc's malloc.h
+# Options of ``mallopt`` in glibc's malloc.h
 M_TRIM_THRESHOLD = -1
 M_MMAP_THRESHOLD = -3
 NEARLY = 0.9
@@ -235,8 +235,7 @@ def keep_freed_memory() -> None:
     """Configure glibc's allocator to keep freed memory for the rest of this process.
 
     Each training step frees and allocates the same hundred megabytes. By default glibc returns them to the system,
-    which
-    clears the pages again. Only the entry points of programs call this, not modules during import.
+    which clears the pages again. Only the entry points of programs call this, not modules during import.
     """
     try:
         libc = ctypes.CDLL(None)

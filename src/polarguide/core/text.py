@@ -61,7 +61,7 @@ def decimals(text: str) -> tuple[float, ...]:
 
 
 def listed(names: Sequence[str], limit: int = 4) -> str:
-    """The first few names and the number of further ones, for messages."""
+    """Return the first few names and the number of the others, for messages."""
     rest = len(names) - limit
     return ", ".join(names[:limit]) + (f" and {rest} more" if rest > 0 else "")
 
@@ -88,7 +88,7 @@ def printable(text: str, *, lines: bool = False) -> str:
 
     Args:
         text: the text.
-        lines: whether line breaks are kept.
+        lines: True: keep line breaks.
     """
     with contextlib.suppress(
         UnicodeEncodeError
@@ -106,8 +106,9 @@ _FORMULA = ("=", "+", "-", "@", "\t", "\r")
 
 
 def csv_lines(rows: Iterable[Iterable[object]]) -> str:
-    """Return rows of values as CSV. None is an empty cell, and an apostrophe precedes a text that looks like a
-    formula.
+    """Return rows of values as CSV.
+
+    None is an empty cell, and an apostrophe precedes a text that looks like a formula.
     """
     file = io.StringIO()
     csv.writer(file, lineterminator="\n").writerows([csv_value(value) for value in row] for row in rows)
@@ -115,7 +116,7 @@ def csv_lines(rows: Iterable[Iterable[object]]) -> str:
 
 
 def csv_value(value: object) -> object:
-    """Return a value that is neither a formula for spreadsheets nor a control sequence for terminals."""
+    """Return a value without formulas for spreadsheets and control sequences for terminals."""
     if not isinstance(value, str):
         return value
     return printable(f"'{value}" if value.startswith(_FORMULA) else value, lines=True)

@@ -116,8 +116,8 @@ class Camera:
             raise _no_matrices("intrinsics [3, 3] and world_to_camera [3, 4] or [4, 4]", found)
         rotation = outer[:3, :3]
         translation = outer[:3, 3]
-        turns = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-5) and np.linalg.det(rotation) > 0
-        if not turns or not (np.abs(translation) <= FARTHEST).all():
+        is_rotation = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-5) and np.linalg.det(rotation) > 0
+        if not is_rotation or not (np.abs(translation) <= FARTHEST).all():
             found = np.array2string(outer[:3], precision=4).replace("\n", "")
             raise _no_matrices(f"a rotation (determinant 1) and a translation up to {FARTHEST:g}", found)
         lens = (inner[0, 0], inner[1, 1]), (inner[0, 2], inner[1, 2])
@@ -182,9 +182,11 @@ class Camera:
         """Return the camera of another picture size that shows this view centered and as large as possible."""
         factor = min(width / self.width, height / self.height)
         scaled = self.scaled(factor, width, height)
-        left = 0.5 * (width - factor * self.width)
-        top = 0.5 * (height - factor * self.height)
-        return replace(scaled, cx=scaled.cx + left, cy=scaled.cy + top)
+        return replace(
+            scaled,
+            cx=scaled.cx + 0.5 * (width - factor * self.width),
+            cy=scaled.cy + 0.5 * (height - factor * self.height),
+        )
 
     def downscaled(self, factor: int) -> Camera:
         """Return the camera of the same view averaged over ``factor`` x ``factor`` pixels; remainders are cut off."""

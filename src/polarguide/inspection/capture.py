@@ -30,7 +30,7 @@ from polarguide.capture.metadata import (
 from polarguide.capture.point_exposures import PointExposures
 from polarguide.capture.scene import read_views
 from polarguide.capture.view import FULL_CODE
-from polarguide.capture.view_reader import StoredViews
+from polarguide.capture.view_reader import ViewData
 from polarguide.core.files import read_file
 from polarguide.core.options import check_choice
 from polarguide.core.progress import SILENT, Reporter
@@ -149,7 +149,10 @@ def read_capture(
     model = read_model(root) if (root / "sparse").exists() else None
     metadata = root / "scene.json"
     text = read_file(metadata, largest=LARGEST_RECORD) if metadata.exists() else b"{}"
-    factor = downscale or _fitting_factor(layout, names[0])
+    first = layout.files(names[0])[0]
+    factor = downscale or max(
+        1, math.ceil(max(decode_picture(first, read_picture(first)).shape[:2]) / LONGEST)
+    )
     stored = read_views(layout, names, model, downscale=factor, transfer=transfer, reporter=reporter)
     lines = sorted(f"{p.relative_to(root)} {d}" for item in stored.data for p, d in item.digests.items())
     indices_of(metadata, text)  # raises an error for invalid indices
@@ -157,7 +160,10 @@ def read_capture(
         root=root,
         name=root.resolve().name,
         layout=layout,
-        views=tuple(_inspected(stored, number) for number in range(len(names))),
+        views=tuple(
+            _inspected_view(item, camera, stored.full_scale)
+            for item, camera in zip(stored.data, stored.cameras, strict=True)
+        ),
         model=model,
         refractive_index=refractive_index_of(metadata, text),
         applied=applied_calibration(metadata, text),
@@ -172,21 +178,14 @@ def read_capture(
     )
 
 
-def _fitting_factor(layout: CaptureFiles, name: str) -> int:
-    path = layout.files(name)[0]
-    height, width = decode_picture(path, read_picture(path)).shape[:2]
-    return max(1, math.ceil(max(height, width) / LONGEST))
-
-
-def _inspected(stored: StoredViews, number: int) -> InspectedView:
-    item = stored.data[number]
+def _inspected_view(item: ViewData, camera: Camera | None, full_scale: int | None) -> InspectedView:
     return InspectedView(
         name=item.name,
         codes=torch.from_numpy(item.codes),
         invalid=torch.from_numpy(item.invalid),
-        saturated=torch.from_numpy(item.saturated(stored.full_scale)),
+        saturated=torch.from_numpy(item.saturated(full_scale)),
         black=torch.from_numpy(item.black),
-        camera=stored.cameras[number],
+        camera=camera,
         peak=int(item.peak.max()),
         exposures=item.exposures,
     )

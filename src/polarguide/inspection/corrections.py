@@ -86,7 +86,7 @@ def fix_scene(capture: Capture, change: Calibration, out: Path, reporter: Report
             remedy="Choose another --fix. Nothing was written.",
         )
     with temporary_folder(out) as partial:
-        _write(capture, change, partial, reporter)
+        _write_corrected(capture, change, partial, reporter)
         if out.is_dir():
             out.rmdir()
         os.replace(partial, out)
@@ -102,7 +102,7 @@ def describe_correction(change: Calibration) -> str:
     return " and ".join(part for part, changed in parts.items() if changed)
 
 
-def _write(capture: Capture, change: Calibration, folder: Path, reporter: Reporter) -> None:
+def _write_corrected(capture: Capture, change: Calibration, folder: Path, reporter: Reporter) -> None:
     (folder / "polar").mkdir()
     for name in _COPIED:
         source = capture.root / name

@@ -279,8 +279,7 @@ def point_evidence(
     certainty = (weights.sum(dim=1) / observed)[None, :, None]
     scale = max(float((spreads * certainty).amin(dim=(0, 2)).median()), EvidenceLimits.least_scale)
     likelihood = -0.5 * (observed - 2.0)[None, :, None] * torch.log1p(spreads * certainty / scale)
-    total = likelihood.sum(dim=1)
-    sense, zero = divmod(int(total.argmax()), DEGREES)
+    sense, zero = divmod(int(likelihood.sum(dim=1).argmax()), DEGREES)
     misfit = math.degrees(math.asin(min(1.0, float(spreads[sense, :, zero].median().sqrt()))))
     note = (
         f"{int(keep.sum())} points with {count} observations above the diffuse limit. At the best zero, their fields "

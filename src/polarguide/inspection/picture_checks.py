@@ -68,10 +68,9 @@ def find_pairing(capture: Capture) -> int | None:
         [checks.measure(view.codes.numpy(), view.usable.numpy()).residuals for view in capture.views]
     )
     gains = measured_exposures(capture) if residuals.any() else None
-    if gains is not None and gains.pairing is not None:
-        precise = AngleLimits.sure * max(gains.errors) < PictureLimits.exposed_unequal
-        if precise:  # exposures may differ
-            return gains.pairing
+    limit = PictureLimits.exposed_unequal / AngleLimits.sure
+    if gains is not None and gains.pairing is not None and max(gains.errors) < limit:
+        return gains.pairing  # for any exposures
     return decide_pairing(residuals)
 
 
@@ -137,8 +136,12 @@ def _pairs(measurements: Sequence[ViewMeasurements], pairing: int | None) -> Che
             "Check for motion or light changes between the shots, and for exchanged files.",
         ),
     )
-    figures = {"median_error": error, "pairing": None if pairing is None else list(PAIRINGS[pairing])}
-    return Check("pair_sums", *outcome, off, figures)
+    return Check(
+        "pair_sums",
+        *outcome,
+        off,
+        {"median_error": error, "pairing": None if pairing is None else list(PAIRINGS[pairing])},
+    )
 
 
 def _encoding(capture: Capture, pairing: int | None) -> Check:
@@ -173,8 +176,9 @@ def _encoding(capture: Capture, pairing: int | None) -> Check:
             "The files seem linear but are decoded, or have another tone curve: try --transfer linear.",
         ),
     )
-    figures = {"curvature": curvature.value, "curvature_error": curvature.error}
-    return Check("encoding", *outcome, figures=figures)
+    return Check(
+        "encoding", *outcome, figures={"curvature": curvature.value, "curvature_error": curvature.error}
+    )
 
 
 def _exposure(
@@ -244,8 +248,12 @@ def _saturation(capture: Capture, measurements: Sequence[ViewMeasurements]) -> C
             "decrease the exposure, and keep lamps out of the picture.",
         ),
     )
-    figures = {"saturated": float(np.mean(shares)), "worst": max(shares), "invalid": invalid, "dark": dark}
-    return Check("saturation", *outcome, off, figures)
+    return Check(
+        "saturation",
+        *outcome,
+        off,
+        {"saturated": float(np.mean(shares)), "worst": max(shares), "invalid": invalid, "dark": dark},
+    )
 
 
 def _noise(measurements: Sequence[ViewMeasurements]) -> Check:
@@ -326,8 +334,9 @@ def _polarization(measurements: Sequence[ViewMeasurements]) -> Check:
             "the filter is a linear polarizer with the right side in front, and that the exposure was fixed.",
         ),
     )
-    figures = {"polarized": share, "median_dolp": median, "p99_dolp": strongest}
-    return Check("low_dolp", *outcome, figures=figures)
+    return Check(
+        "low_dolp", *outcome, figures={"polarized": share, "median_dolp": median, "p99_dolp": strongest}
+    )
 
 
 def dielectric_check(

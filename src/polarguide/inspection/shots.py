@@ -253,8 +253,7 @@ def agreement_checks(capture: Capture) -> list[Check]:
             "Correct their lines of angles.csv, or write unknown. Repeat prepare without pictures that moved.",
         ),
     )
-    figures = {"views": compared, "contradicting": len(wrong)}
-    return [Check("agreement", *outcome, tuple(wrong), figures)]
+    return [Check("agreement", *outcome, tuple(wrong), {"views": compared, "contradicting": len(wrong)})]
 
 
 def shot_checks(findings: ShotFindings) -> list[Check]:
@@ -301,8 +300,12 @@ def _modulation(findings: ShotFindings) -> Check:
         ),
         (True, "ok", finding, ""),
     )
-    figures = {"pictures": count, "unfiltered": len(plain), "vague": vague, "modulation": modulation}
-    return Check("modulation", *outcome, plain, figures)
+    return Check(
+        "modulation",
+        *outcome,
+        plain,
+        {"pictures": count, "unfiltered": len(plain), "vague": vague, "modulation": modulation},
+    )
 
 
 def _sense(findings: ShotFindings, sense: int | None) -> Check:
@@ -321,8 +324,11 @@ def _sense(findings: ShotFindings, sense: int | None) -> Check:
             "Repeat prepare with the other --sense and a new --out.",
         ),
     )
-    figures = {} if alike or sense is None else {"counter_clockwise": float(sense == 1)}
-    return Check("handedness", *outcome, figures=figures)
+    return Check(
+        "handedness",
+        *outcome,
+        figures={} if alike or sense is None else {"counter_clockwise": float(sense == 1)},
+    )
 
 
 def _zero(findings: ShotFindings, rotation: CommonRotation) -> Check:
@@ -366,7 +372,7 @@ def _each(findings: ShotFindings, rotation: CommonRotation) -> Check:
         )
         return Check("angles", *outcome, figures={"doubtful": doubtful, "unknown": unknown} if doubts else {})
     rows = [
-        (j, angle, AngleEstimate(j.angle, j.spread, sense * angle + offset))
+        (j, angle, AngleEstimate(j.angle, j.spread, sense * angle + offset, ShotLimits.contradicts))
         for j, angle in findings.determined
     ]
     typical = float(np.median([abs(estimate.off) for _, _, estimate in rows]))
@@ -374,7 +380,7 @@ def _each(findings: ShotFindings, rotation: CommonRotation) -> Check:
     off = [
         (j, angle)
         for j, angle, estimate in rows
-        if estimate.contradicts(ShotLimits.contradicts, typical, sigmas=ShotLimits.sigmas)
+        if replace(estimate, usual=typical, sigmas=ShotLimits.sigmas).contradicts
         and j.modulation > certain
         and not j.poorly_explained
     ]
@@ -389,5 +395,9 @@ def _each(findings: ShotFindings, rotation: CommonRotation) -> Check:
             "Correct their lines of angles.csv, or write unknown.",
         ),
     )
-    figures = {"median_degrees": typical, "compared": len(rows), "unknown": unknown}
-    return Check("angles", *outcome, tuple(dict.fromkeys(j.view for j, _ in off)), figures)
+    return Check(
+        "angles",
+        *outcome,
+        tuple(dict.fromkeys(j.view for j, _ in off)),
+        {"median_degrees": typical, "compared": len(rows), "unknown": unknown},
+    )

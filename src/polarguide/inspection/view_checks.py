@@ -105,8 +105,12 @@ def lens_check(capture: Capture) -> Check:
             "Prepare the original files, whose EXIF distinguishes them, or use a model with a camera for each.",
         ),
     )
-    figures = {"rms": usual, "views": dict(zip(names, (np.exp(logs) - 1).tolist(), strict=True))}
-    return Check("focal_lengths", *outcome, tuple(names[k] for k in order), figures)
+    return Check(
+        "focal_lengths",
+        *outcome,
+        tuple(names[k] for k in order),
+        {"rms": usual, "views": dict(zip(names, (np.exp(logs) - 1).tolist(), strict=True))},
+    )
 
 
 def _focal_length_alone(model: ColmapModel, view: str) -> tuple[float, float] | None:

@@ -13,6 +13,7 @@ is small, and no Brewster's angle exists. In ``c`` and ``a + i b = sqrt((n + i k
 counterpart of ``t``,
 
     Rs = (a^2 + b^2 + c^2 - 2 a c) / (a^2 + b^2 + c^2 + 2 a c)
+
     Rp = Rs (x - y sin^2 i) / (x + y sin^2 i),  x = c^2 (a^2 + b^2) + sin^4 i,  y = 2 a c
 
 (the absolute squares of the complex amplitudes; Born and Wolf 1999, Sec. 14.4, give the same quantities).

@@ -1,19 +1,19 @@
-"""Normals from polarization: candidates, the choice among them, the pixels that can tell, and color differences.
+"""Normals from polarization: candidates, the choice among them, masks of reliable pixels, and color differences.
 
-The polarization of one pixel leaves a surface normal ambiguous: the angle of polarization gives the azimuth
-up to a half turn, plus a quarter turn because specular and diffuse light are polarized at right angles.
-Zenith and azimuth are relative to the view ray of the pixel (see ``frames``); all normals are in camera axes.
+The polarization of one pixel determines a surface normal ambiguously. The angle of polarization gives the azimuth up
+to half a turn, and up to a quarter turn because specular and diffuse light are polarized at right angles. Zenith and
+azimuth are relative to the view ray of the pixel (see ``frames``). All normals are in camera axes.
 
-Light reflected at a dielectric surface has nearly the color of what it reflects; light from below has the
-color of the body. Between the color channels of a pixel it is therefore mostly diffuse light that differs,
-and how polarization differs with it shows the diffuse lobe alone, however much specular light lies over it
-(the two colors of Nayar, Fang and Boult 1997, "Separation of reflection components using color and
-polarization", with the diffuse light's own polarization). In a channel c of a pixel,
+A dielectric surface reflects light without changing its color, while light from below has the color of the body. So
+mostly diffuse light differs between the color channels of a pixel. The differences of polarization show the diffuse
+lobe alone, for any amount of specular light. This combines the two colors of Nayar, Fang and Boult 1997 ("Separation
+of reflection components using color and polarization") with the polarization of diffuse light. In a channel c of a
+pixel,
 
     (S1, S2)_c = (rho_s specular - rho_d diffuse_c) (cos, sin)(2 (azimuth + pi/2)),
 
-so the slope of (S1, S2) over S0 among the channels is ``rho_d (cos, sin)(2 azimuth)``: the azimuth up to half
-a turn, without the quarter turn, and the zenith of the diffuse lobe, without the bias of a mixture.
+so the slope of (S1, S2) over S0 among the channels is ``rho_d (cos, sin)(2 azimuth)``. It determines the azimuth up to
+half a turn, without the ambiguity of a quarter turn, and the zenith of the diffuse lobe without the bias of a mixture.
 """
 
 from __future__ import annotations
@@ -40,12 +40,12 @@ from polarguide.optics.stokes import aolp, dolp, luminance
 
 
 class Candidates(NamedTuple):
-    """The four candidates of PolarGuide-GSDR.
+    """Four candidate normals of PolarGuide-GSDR.
 
     Attributes:
         normals: [..., 4, 3] unit: n, -n, R n, -R n, where R turns by 90 degrees about the view axis.
-        zenith: [...] radians, of n.
-        azimuth: [...] radians, of n.
+        zenith: [...] zenith of n in radians.
+        azimuth: [...] azimuth of n in radians.
     """
 
     normals: Tensor
@@ -54,14 +54,14 @@ class Candidates(NamedTuple):
 
 
 class PhysicalCandidates(NamedTuple):
-    """The six normals that Fresnel's equations allow for a pixel of one pure lobe.
+    """Six normals that Fresnel's equations allow for a pixel of one pure lobe.
 
     Attributes:
         normals: [..., 6, 3] unit, all facing the camera: two diffuse, two specular below Brewster's angle,
             two specular above it; within each pair the azimuths are half a turn apart.
-        valid: [..., 6] bool: False for the diffuse pair where the degree of polarization exceeds what diffuse
-            light can have, and for all six where S0 is not positive.
-        specular: [6] bool: which candidates explain the pixel by specular light.
+        valid: [..., 6] bool: False for the diffuse pair if the degree of polarization exceeds the limit of diffuse
+            light, and for all six if S0 is not positive.
+        specular: [6] bool: True for candidates of the specular lobe.
     """
 
     normals: Tensor
@@ -70,12 +70,12 @@ class PhysicalCandidates(NamedTuple):
 
 
 class Disambiguated(NamedTuple):
-    """The chosen candidates.
+    """Chosen candidates.
 
     Attributes:
         normal: [..., 3] unit.
         choice: [...] int64, position among the candidates.
-        cosine: [...] between the chosen normal and the guide, in [-1, 1].
+        cosine: [...] cosine between the chosen normal and the guide, in [-1, 1].
     """
 
     normal: Tensor
@@ -85,11 +85,11 @@ class Disambiguated(NamedTuple):
 
 @for_arrays
 def paper_candidates(stokes: Tensor, rays: Tensor, refractive_index: float | Tensor = 1.5) -> Candidates:
-    """Four candidate normals as in PolarGuide-GSDR: n, -n, R n, -R n.
+    """Return four candidate normals as in PolarGuide-GSDR: n, -n, R n, -R n.
 
-    n has the angle of polarization as azimuth and the diffuse zenith of the degree of polarization. The closed form
-    that PolarGuide-GSDR prints for this zenith has three misprints; corrected, it equals ``diffuse_zenith``. Two of the
-    four candidates face away from the camera.
+    The azimuth of n is the angle of polarization, and its zenith is the diffuse zenith of the degree of polarization.
+    The closed form of this zenith in PolarGuide-GSDR has three misprints; corrected, it equals ``diffuse_zenith``.
+    Two of the four candidates face away from the camera.
 
     Args:
         stokes: [3, ...] of the luminance.
@@ -113,7 +113,7 @@ def paper_candidates(stokes: Tensor, rays: Tensor, refractive_index: float | Ten
 def physical_candidates(
     stokes: Tensor, rays: Tensor, refractive_index: float | Tensor = 1.5
 ) -> PhysicalCandidates:
-    """Six candidate normals that face the camera: the exact inverses of both lobes.
+    """Return six candidate normals that face the camera: the exact inverses of both lobes.
 
     Diffuse zenith at azimuth AoLP and AoLP + pi; the two specular zeniths at AoLP + pi/2 and AoLP - pi/2.
 
@@ -123,7 +123,7 @@ def physical_candidates(
         refractive_index: refractive index of the surface, more than 1: a number or [...].
 
     Returns:
-        PhysicalCandidates. Candidates that are not valid hold the clamped value.
+        PhysicalCandidates. Invalid candidates hold the clamped value.
 
     Raises:
         ValueError: the first axis of ``stokes`` is not 3, or ``refractive_index`` is a number not above 1.
@@ -150,15 +150,14 @@ def disambiguate(
 ) -> Disambiguated:
     """Choose the candidate nearest to a guide normal (the cosine rule of PolarGuide-GSDR).
 
-    The score of a candidate is its cosine with the guide. With ``azimuth_weight`` w it becomes
-    ``(1 - w s) cosine + w s cos(difference of azimuths)``, s the sine of the guide's zenith: a wrong
-    refractive index or a mixture of lobes shifts the zenith of a candidate and leaves its azimuth, which
-    therefore is the better evidence wherever the guide has an azimuth at all. Candidates marked not valid are
-    chosen only if all are.
+    The score of a candidate is its cosine with the guide. With ``azimuth_weight`` w it becomes ``(1 - w s) cosine + w
+    s cos(difference of azimuths)``, with s the sine of the guide's zenith. A wrong refractive index or a mixture of
+    lobes shifts the zenith of a candidate but not its azimuth, so the azimuth is the more reliable evidence if the
+    guide has one. Invalid candidates are chosen only if all are invalid.
 
     Args:
         candidates: candidates, or their normals [..., K, 3] in camera axes.
-        guide: [..., 3] camera axes; only the direction matters. Detach it if it is being trained.
+        guide: [..., 3] camera axes; only the direction matters. Detach it if it is trained.
         rays: [..., 3] unit camera rays; needed for ``azimuth_weight > 0``.
         azimuth_weight: in [0, 1].
 
@@ -194,20 +193,20 @@ def disambiguate(
 
 @for_arrays
 def dolp_noise(stokes: Tensor, noise_sigma: float | Tensor) -> Tensor:
-    """Standard deviation of the degree of polarization d under independent noise on the four intensities.
+    """Return the standard deviation of the degree of polarization d for independent noise on the four intensities.
 
-    With standard deviation ``sigma`` per intensity, S1 and S2 have ``sqrt(2) sigma``, S0 has ``sigma``, and
-    S0 is uncorrelated with both; to first order ``sigma sqrt(2 + d^2) / S0``, which is ``sqrt(2) sigma / S0``
-    for weakly polarized light. Without any polarization the measured d is not zero but Rayleigh-distributed
-    with this scale (mean 1.25 of it; 1.1 % of such pixels exceed 3).
+    With standard deviation ``sigma`` per intensity, S1 and S2 have ``sqrt(2) sigma`` and S0 has ``sigma``. S0 is
+    uncorrelated with both. To first order d has ``sigma sqrt(2 + d^2) / S0``, which is ``sqrt(2) sigma / S0`` for
+    weakly polarized light. For unpolarized light the measured d has a Rayleigh distribution with this scale: its mean
+    is 1.25 scales, and 1.1 % of the pixels exceed 3 scales.
 
     Args:
         stokes: [3, ...].
         noise_sigma: standard deviation of one of the four intensities in the units of ``stokes``, a number or [...].
-            For the mean over three colors with independent noise, 1/sqrt(3) of one channel's.
+            The mean over three colors with independent noise has 1/sqrt(3) of the value of one channel.
 
     Returns:
-        [...]; infinite where S0 <= 0 and the noise is positive.
+        [...]; infinite if S0 <= 0 and the noise is positive.
     """
     check_leading(stokes, 3, "stokes")
     s0 = stokes[0].clamp(min=0)
@@ -217,11 +216,11 @@ def dolp_noise(stokes: Tensor, noise_sigma: float | Tensor) -> Tensor:
 
 @for_arrays
 def intensity_noise(intensities: Tensor, window: int = 15) -> Tensor:
-    """Standard deviation of the noise of one of the four intensities, read from the pictures themselves.
+    """Estimate the standard deviation of the noise of one of the four intensities from the pictures.
 
-    Four angles measure three unknowns: ``I0 + I90 - I45 - I135`` is zero but for noise, whose variance it has
-    four times. Taken about its mean over the window, unequal gains of the angles do not count as noise; light
-    that moved between the shots does, as it should.
+    Four angles measure three unknowns: without noise ``I0 + I90 - I45 - I135`` is zero, and its variance is four
+    times the variance of the noise. It is taken about the mean over the window, so unequal gains of the angles do not
+    count as noise. Changes of the light between shots count as noise.
 
     Args:
         intensities: [4, H, W], of one channel or of the mean over the colors.
@@ -252,19 +251,18 @@ def polarization_mask(
     snr: float = 3.0,
     saturated: Tensor | None = None,
 ) -> Tensor:
-    """Pixels whose polarization is strong and certain enough to say something about the normal.
+    """Return a mask of pixels with a polarization that is strong and certain enough for a normal.
 
     Args:
         stokes: [3, ...] of the luminance.
-        threshold: least degree of polarization (exclusive).
+        threshold: exclusive lower bound of the degree of polarization.
         invalid: [...] bool, pixels without data.
-        noise_sigma: standard deviation of one of the four intensities, see ``dolp_noise``; 0 switches the
-            noise test off.
-        snr: least ratio of the degree of polarization to its noise (exclusive).
-        saturated: [...] bool, pixels where any of the four images clips.
+        noise_sigma: standard deviation of one of the four intensities, see ``dolp_noise``; 0 disables the noise test.
+        snr: exclusive lower bound of the degree of polarization over its noise.
+        saturated: [...] bool, pixels that are clipped in one of the four images.
 
     Returns:
-        [...] bool; False where S0 <= 0.
+        [...] bool; False if S0 <= 0.
     """
     degree = dolp(stokes)
     mask = (degree > threshold) & (stokes[0] > 0)
@@ -280,11 +278,10 @@ class ChromaticNormals(NamedTuple):
     """Normals from color differences, as angles.
 
     Attributes:
-        zenith: [H, W] radians, of the diffuse lobe whose degree of polarization is the slope's.
+        zenith: [H, W] radians, at which the degree of polarization of the diffuse lobe equals the slope.
         azimuth: [H, W] radians in (-pi/2, pi/2], up to half a turn.
-        certainty: [H, W] explained over unexplained polarization, a ratio of standard deviations; 0 where
-            there is no color.
-        decided: [H, W] bool, where diffuse light alone can explain the slope: see ``chromatic_normals``.
+        certainty: [H, W] explained over unexplained polarization, a ratio of standard deviations; 0 without color.
+        decided: [H, W] bool, True if only diffuse light can explain the slope, see ``chromatic_normals``.
         contrast: [H, W] standard deviation of S0 among the colors of the window, as a share of S0; 0 or more.
     """
 
@@ -305,24 +302,23 @@ def chromatic_normals(
     minimum_contrast: float = 0.05,
     pure_lobe_dolp: float = 0.05,
 ) -> ChromaticNormals:
-    """Zenith and azimuth from the slope of (S1, S2) over S0 among the colors of a small window.
+    """Estimate zenith and azimuth from the slope of (S1, S2) over S0 among the colors of a small window.
 
-    A colored reflection has a slope of its own, ``rho_s`` times the opposite direction. The two are told
-    apart by the mean polarization: where it points against the slope, both lobes are there, and the one that
-    differs between colors is the weaker in polarization, which body color explains; where it points along
-    the slope, the pixel may be one colored lobe of either kind, and is decided only if its degree of
-    polarization is as small as diffuse light has it at most zeniths.
+    A colored reflection has a slope of ``rho_s`` times the opposite direction. The mean polarization distinguishes
+    both cases. If it points against the slope, the pixel has both lobes, and the lobe that differs between colors has
+    the weaker polarization: the diffuse lobe. If it points along the slope, the pixel can be one colored lobe of either
+    kind. It is decided only if its degree of polarization is small, as for diffuse light at most zeniths.
 
     Args:
         stokes: [3, H, W, C] with the colors last.
         refractive_index: refractive index of the surface, more than 1.
         window: odd side of the window in pixels; the surface should be flat over it.
-        minimum_certainty: least certainty of a decided pixel.
-        minimum_contrast: least standard deviation of S0 among the colors, as a share of S0.
-        pure_lobe_dolp: largest degree of polarization where the mean points along the slope.
+        minimum_certainty: lower bound of the certainty of a decided pixel.
+        minimum_contrast: lower bound of the standard deviation of S0 among the colors, as a share of S0.
+        pure_lobe_dolp: upper bound of the degree of polarization if the mean points along the slope.
 
     Returns:
-        ChromaticNormals. Nothing is decided in a picture without color.
+        ChromaticNormals. A picture without color has no decided pixel.
 
     Raises:
         ValueError: ``stokes`` is not [3, H, W, C], ``window`` is even, or ``refractive_index`` is not above 1.
@@ -343,7 +339,7 @@ def chromatic_normals(
     degree = torch.hypot(slope1, slope2)
     explained = degree * variance.sqrt()
     unexplained = (spread - explained**2).clamp(min=0).sqrt()
-    # What rounding leaves of a picture without color explains nothing.
+    # Rounding errors of a picture without color must not count as color.
     colored = variance.sqrt() > minimum_contrast * s0
     certainty = torch.where(colored, explained / unexplained.clamp(min=1e-6 * s0.abs() + least), 0.0)
     limit = diffuse_dolp_limit(refractive_index)

@@ -1,7 +1,7 @@
-"""Separating specular from diffuse light, and predicting the polarization of their sum.
+"""Separation of specular and diffuse light, and prediction of the polarization of their sum.
 
-Both layers are in units of S0, like the first Stokes component: what a photograph shows of a layer is half of
-it. The light that falls on the surface is taken to be unpolarized and the surface to be a smooth dielectric.
+Both layers are in units of S0, twice the intensity in a photograph. The incident light is assumed to be unpolarized and
+the surface to be a smooth dielectric.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from polarguide.optics.fresnel import dolp_slopes, reflectances, transmittances
 
 
 class Separation(NamedTuple):
-    """Two layers of one picture.
+    """Specular and diffuse layer of one picture.
 
     Attributes:
-        specular: [..., C] reflected at the surface, units of S0.
-        diffuse: [..., C] from below the surface, units of S0.
-        conditioned: [...] bool, where the values can be trusted. One per pixel, without the color axis.
+        specular: [..., C] light reflected at the surface, units of S0.
+        diffuse: [..., C] light from below the surface, units of S0.
+        conditioned: [...] bool, True for pixels with reliable values; without the color axis.
     """
 
     specular: Tensor
@@ -32,7 +32,7 @@ class Separation(NamedTuple):
 
 
 def _components(normals: Tensor, rays: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Components of the unit normal: toward the camera (cos(zenith)), image right, image up."""
+    """Return the components of the unit normal toward the camera (cos(zenith)), image right and image up."""
     unit = safe_normalize(normals)
     x_ref, up_ref = lens_frame(rays)
     return -dot(unit, rays), dot(unit, x_ref), dot(unit, up_ref)
@@ -49,22 +49,22 @@ def exact_separation(
 ) -> Separation:
     """Solve S1 and S2 for both layers, given the normal.
 
-    Specular light is polarized perpendicular to the plane of incidence with degree rho_s, diffuse light in
-    the plane with degree rho_d (Fresnel's equations). With P the part of (S1, S2) along the perpendicular,
-    ``P = rho_s specular - rho_d diffuse`` and ``S0 = specular + diffuse``, so
-    ``specular = (P + rho_d S0) / (rho_s + rho_d)``, limited to [0, S0], each color on its own.
+    Specular light is polarized perpendicular to the plane of incidence with degree rho_s, diffuse light in the plane
+    with degree rho_d (Fresnel's equations). With P the part of (S1, S2) along the perpendicular, ``P = rho_s specular
+    - rho_d diffuse`` and ``S0 = specular + diffuse``. So ``specular = (P + rho_d S0) / (rho_s + rho_d)``, limited to
+    [0, S0], separately for each color.
 
     Args:
         stokes: [3, ..., C] with the colors last.
         normals: [..., 3] camera axes; only the direction matters.
         rays: [..., 3] unit camera rays.
         refractive_index: refractive index of the surface, more than 1: a number or [...].
-        minimum_contrast: least ``rho_s + rho_d`` that counts as well-conditioned. The default excludes
-            zeniths below about 11 degrees at n = 1.5. The divisor itself is held above a tenth of it, which
-            bounds the amplification of noise.
+        minimum_contrast: lower bound of ``rho_s + rho_d`` for well-conditioned pixels. The default excludes zeniths
+            below about 11 degrees at n = 1.5. A tenth of it is the lower bound of the divisor, which limits the
+            amplification of noise.
 
     Returns:
-        Separation in units of S0. ``conditioned`` is also False where the normal faces away or is zero.
+        Separation in units of S0. ``conditioned`` is also False if the normal faces away or is zero.
 
     Raises:
         ValueError: the first axis of ``stokes`` is not 3, or ``refractive_index`` is a number not above 1.
@@ -76,7 +76,7 @@ def exact_separation(
     contrast = (specular_slope + diffuse_slope) * sine2
     s0, s1, s2 = stokes.unbind(0)
     s0 = s0.clamp(min=0)
-    # Cosine and sine of twice the azimuth. Without an azimuth they are 0, and so is the contrast.
+    # Cosine and sine of twice the azimuth. For an undefined azimuth they and the contrast are 0.
     across = (x * x + y * y).clamp(min=torch.finfo(x.dtype).eps)
     double_cos = (x * x - y * y) / across
     double_sin = 2 * x * y / across
@@ -89,12 +89,11 @@ def exact_separation(
 
 @for_arrays
 def paper_separation(stokes: Tensor, zenith: Tensor, refractive_index: float | Tensor = 1.5) -> Separation:
-    """The reflection cue of PolarGuide-GSDR, averaged over the four polarizer angles.
+    """Return the reflection cue of PolarGuide-GSDR, averaged over the four polarizer angles.
 
-    The observed S0 goes through Fresnel's equations: specular ``S0 R``, and the rest
-    ``S0 (1 - R)`` transmitted once more, ``S0 (1 - R) T``, with R and T the means over s and p. The average
-    over the polarizer angles does not change when the camera rolls. It is a coarse cue: the share of the
-    specular layer depends on the zenith alone, and the layers do not add up to S0.
+    Fresnel's equations divide the observed S0 into specular ``S0 R`` and diffuse ``S0 (1 - R) T``, with R and T the
+    means over s and p. The average over the polarizer angles does not change when the camera rolls. The cue is
+    coarse: the share of the specular layer depends on the zenith alone, and the sum of the layers is not S0.
 
     Args:
         stokes: [3, ..., C] with the colors last.
@@ -125,13 +124,13 @@ def paper_intensities(
     polarizer: float | Tensor,
     refractive_index: float | Tensor = 1.5,
 ) -> tuple[Tensor, Tensor]:
-    """Intensities of both layers behind a polarizer, by the reflection cue of PolarGuide-GSDR.
+    """Return intensities of both layers behind a polarizer by the reflection cue of PolarGuide-GSDR.
 
-    A layer's intensity is ``(Imax + Imin) / 2 + (Imax - Imin) / 2 * cos 2(polarizer - d)``. The specular layer has
-    ``Imax = S0 / 2 * Rs``, ``Imin = S0 / 2 * Rp`` and ``d = s_direction``. The diffuse layer has Tp and Ts of the light
-    that is left in place of Rs and Rp of S0, and d is perpendicular to ``s_direction``. (PolarGuide-GSDR has ``cos 2
-    theta`` with the angle from the image's x axis, which would change when the camera rolls.) The mean over the four
-    polarizer angles is half of what ``paper_separation`` returns.
+    The intensity of a layer is ``(Imax + Imin) / 2 + (Imax - Imin) / 2 * cos 2(polarizer - d)``. The specular layer has
+    ``Imax = S0 / 2 * Rs``, ``Imin = S0 / 2 * Rp`` and ``d = s_direction``. The diffuse layer has the remaining light
+    instead of S0, Tp and Ts instead of Rs and Rp, and d perpendicular to ``s_direction``. (PolarGuide-GSDR has
+    ``cos 2 theta`` with the angle from the image's x axis, which changes when the camera rolls.) The mean over the four
+    polarizer angles is half of ``paper_separation``.
 
     Args:
         stokes: [3, ..., C] with the colors last.
@@ -153,7 +152,7 @@ def paper_intensities(
     s0 = stokes[0].clamp(min=0)
     left = s0 * (1 - (rs + rp) / 2)[..., None]
     specular = s0 / 4 * (rs + rp + (rs - rp) * wave)[..., None]
-    # In the p-direction the cosine changes sign.
+    # The cosine has the opposite sign in the p-direction.
     diffuse = left / 4 * (tp + ts - (tp - ts) * wave)[..., None]
     return specular, diffuse
 
@@ -162,13 +161,12 @@ def paper_intensities(
 def predicted_stokes(
     specular: Tensor, diffuse: Tensor, normals: Tensor, rays: Tensor, refractive_index: float | Tensor = 1.5
 ) -> Tensor:
-    """Stokes vector that a camera measures of two layers on a surface with a known normal.
+    """Predict the measured Stokes vector of two layers on a surface with a known normal.
 
-    ``S0 = specular + diffuse`` and
-    ``(S1, S2) = (rho_s specular - rho_d diffuse) (cos, sin)(2 (azimuth + pi/2))`` with both degrees of
-    polarization from Fresnel's equations. It inverts ``exact_separation``. Value and gradient are smooth
-    where the normal is parallel to the ray (no polarization); a zero normal gives no polarization, and one
-    that faces away counts as grazing.
+    ``S0 = specular + diffuse`` and ``(S1, S2) = (rho_s specular - rho_d diffuse) (cos, sin)(2 (azimuth + pi/2))``,
+    with both degrees of polarization from Fresnel's equations. It is the inverse of ``exact_separation``. Value and
+    gradient are smooth if the normal is parallel to the ray, without polarization. A zero normal has no polarization,
+    and a normal that faces away counts as grazing.
 
     Args:
         specular, diffuse: [..., C] units of S0, the colors last.
@@ -184,7 +182,7 @@ def predicted_stokes(
     """
     cosine, x, y = _components(normals, rays)
     specular_slope, diffuse_slope = dolp_slopes(cosine, refractive_index)
-    # sin^2 times the cosine and sine of twice the azimuth; the slopes lack just that factor.
+    # sin^2, a factor that the slopes lack, times the cosine and sine of twice the azimuth.
     double_cos = x * x - y * y
     double_sin = 2 * x * y
     polarized = diffuse_slope[..., None] * diffuse - specular_slope[..., None] * specular

@@ -1,11 +1,10 @@
-"""Linear Stokes vectors: how polarizers measure them, quantities derived from them, and their uncertainty.
+"""Linear Stokes vectors: measurement by polarizers, derived quantities, and their uncertainty.
 
-A Stokes tensor has the three linear components (S0, S1, S2) on its **first** axis and any shape after it. All
-values are linear radiance. Angles are radians, zero along the image's horizontal, counter-clockwise as
-displayed.
+A Stokes tensor has the three linear components (S0, S1, S2) on its **first** axis and any shape after it. All values
+are linear radiance. Angles are radians, zero along the image's horizontal, counter-clockwise as displayed.
 
-An analyzer is the pair (cos 2t, sin 2t) of the angle t, in the lens frame of its pixel, of the field that it passes:
-its intensity is ``(S0 + S1 cos 2t + S2 sin 2t) / 2`` (Malus's law).
+An analyzer transmits a field at an angle t in the lens frame of its pixel. It is represented by (cos 2t, sin 2t), and
+the intensity behind it is ``(S0 + S1 cos 2t + S2 sin 2t) / 2`` (Malus's law).
 """
 
 from __future__ import annotations
@@ -24,39 +23,38 @@ from polarguide.optics.frames import lens_frame
 
 
 def stokes(intensities: Tensor) -> Tensor:
-    """Stokes vector of four images taken behind a polarizer at 0, 45, 90 and 135 degrees.
+    """Return the Stokes vector of four images behind a polarizer at 0, 45, 90 and 135 degrees.
 
-    ``S0 = (I0 + I45 + I90 + I135) / 2``, ``S1 = I0 - I90``, ``S2 = I45 - I135`` (the least-squares solution
-    of Malus's law).
+    ``S0 = (I0 + I45 + I90 + I135) / 2``, ``S1 = I0 - I90``, ``S2 = I45 - I135`` (the least-squares solution of Malus's
+    law).
 
     Args:
-        intensities: [4, ...] linear intensities in the order of ``ANGLES``; whole numbers of 8 or 16 bits are codes of
-            which the largest of their type is 1, as ``read_shot`` takes them.
+        intensities: [4, ...] linear intensities in the order of ``ANGLES``. Unsigned integers of 8 or 16 bits are
+            divided by the maximum of their type, as in ``read_shot``.
 
     Returns:
         [3, ...] Stokes vector, in the units of the intensities.
 
     Raises:
-        ValueError: the first axis does not have four entries, or the type of whole numbers tells no full scale.
+        ValueError: the first axis does not have four entries, or other integers have no known full scale.
     """
     return _stokes(_of_full_scale(intensities))
 
 
 def _of_full_scale(intensities: Any) -> Any:
-    """Floats as they are; codes of 8 or 16 bits, NumPy's or torch's, as shares of full scale in single precision.
+    """Divide codes of 8 or 16 bits by full scale, in single precision; floats are unchanged.
 
     Raises:
-        ValueError: the values are other whole numbers.
+        ValueError: the values are other integers.
     """
-    values = intensities.numpy() if intensities.dtype in (torch.uint8, torch.uint16) else intensities
-    if isinstance(values, np.ndarray) and values.dtype.kind == "u" and values.dtype.itemsize <= 2:
-        shares = values.astype(np.float32) / np.float32(np.iinfo(values.dtype).max)
+    kind = getattr(intensities.dtype, "name", str(intensities.dtype).removeprefix("torch."))
+    if kind in ("uint8", "uint16"):
+        shares = np.asarray(intensities).astype(np.float32) / np.float32(np.iinfo(kind).max)
         return torch.from_numpy(shares) if isinstance(intensities, Tensor) else shares
-    kind = values.dtype.kind if isinstance(values, np.ndarray) else "f" if values.is_floating_point() else "i"
-    if kind in "iub":
-        found = f"found {values.dtype}; divide them by full scale"
+    if "int" in kind or kind == "bool":
+        found = f"found {intensities.dtype}; divide them by full scale"
         raise ValueError(f"intensities: expected floats, or codes of type uint8 or uint16, {found}")
-    return values
+    return intensities
 
 
 @for_arrays
@@ -67,7 +65,7 @@ def _stokes(intensities: Tensor) -> Tensor:
 
 @for_arrays
 def intensity(stokes: Tensor, angle: float | Tensor) -> Tensor:
-    """Intensity behind an ideal polarizer: Malus's law, ``(S0 + S1 cos 2a + S2 sin 2a) / 2``.
+    """Return the intensity behind an ideal polarizer by Malus's law, ``(S0 + S1 cos 2a + S2 sin 2a) / 2``.
 
     Args:
         stokes: [3, ...].
@@ -82,49 +80,48 @@ def intensity(stokes: Tensor, angle: float | Tensor) -> Tensor:
 
 @for_arrays
 def dolp(stokes: Tensor) -> Tensor:
-    """Degree of linear polarization, ``sqrt(S1^2 + S2^2) / S0``.
+    """Return the degree of linear polarization, ``sqrt(S1^2 + S2^2) / S0``.
 
     Args:
         stokes: [3, ...].
 
     Returns:
-        [...] in [0, 1]: clamped at 1 (noise can exceed it), and 0 where S0 <= 0. The gradient is 0 where the
-        light is unpolarized.
+        [...] in [0, 1]; noise above 1 is clamped. It is 0 if S0 <= 0. The gradient is 0 for unpolarized light.
     """
     check_leading(stokes, 3, "stokes")
     s0 = stokes[0]
     live = s0 > torch.finfo(s0.dtype).tiny
     size = torch.where(live, s0, torch.ones_like(s0))
-    # |S1|, |S2| <= S0 for real light; clamping them first bounds the quotient, and with it the gradient.
+    # |S1|, |S2| <= S0 for physical light; clamping them bounds the quotient and its gradient.
     parts = torch.minimum(torch.maximum(stokes[1:], -size), size) / size
-    # Written out: torch's norm over two is slow.
+    # Written out, because PyTorch's norm over two components is slow.
     degree = safe_sqrt(parts[0] ** 2 + parts[1] ** 2).clamp(max=1)
     return torch.where(live, degree, torch.zeros_like(degree))
 
 
 @for_arrays
 def aolp(stokes: Tensor) -> Tensor:
-    """Angle of linear polarization, ``atan2(S2, S1) / 2``: the direction of the electric field.
+    """Return the angle of linear polarization, ``atan2(S2, S1) / 2``: the direction of the electric field.
 
-    Never average or interpolate these angles; average Stokes vectors and take the angle afterwards.
+    Do not average or interpolate these angles: average Stokes vectors and compute the angle afterwards.
 
     Args:
         stokes: [3, ...].
 
     Returns:
-        [...] radians in [0, pi); 0, with zero gradient, where the light is unpolarized.
+        [...] radians in [0, pi); 0 with zero gradient for unpolarized light.
     """
     check_leading(stokes, 3, "stokes")
     angle = safe_atan2(stokes[2], stokes[1]) / 2
     angle = torch.where(angle < 0, angle + math.pi, angle)
-    # A tiny negative angle plus pi rounds to pi (in single precision, to a number above it), which is the angle 0.
+    # A tiny negative angle plus pi rounds to pi or, in single precision, above it. It is the angle 0.
     largest = torch.tensor(math.pi, dtype=angle.dtype, device=angle.device)
     return torch.where(angle >= largest, angle - largest, angle)
 
 
 @for_arrays
 def photograph(stokes: Tensor) -> Tensor:
-    """The picture without a polarizer on the exposure scale of the four images: their mean, ``S0 / 2``.
+    """Return the picture without a polarizer on the scale of the four images: their mean, ``S0 / 2``.
 
     Args:
         stokes: [3, ...].
@@ -138,10 +135,9 @@ def photograph(stokes: Tensor) -> Tensor:
 
 @for_arrays
 def luminance(stokes: Tensor) -> Tensor:
-    """Stokes vector of the color channels taken together: their plain mean.
+    """Return the mean Stokes vector of the color channels.
 
-    Angles and degrees of polarization of a color picture are read from this mean; they are not averaged
-    themselves.
+    Angles and degrees of polarization of a color picture are computed from this mean and not averaged themselves.
 
     Args:
         stokes: [3, ..., C] with the colors on the last axis.
@@ -154,32 +150,31 @@ def luminance(stokes: Tensor) -> Tensor:
 
 
 Mount = Literal["sensor", "filter"]
-"""Where the polarizer is: behind the lens, or a sheet before it."""
+"""Place of the polarizer: on the sensor, or a sheet before the lens."""
 
 
 @for_arrays
 def filter_analyzer(angle: float | Tensor, rays: Tensor) -> Tensor:
-    """Analyzer of a sheet polarizer before the lens.
+    """Return the analyzer of a sheet polarizer before the lens.
 
-    A sheet absorbs the field along its absorption axis a, which lies in the plane of the picture, and passes what is
-    perpendicular to a and to the ray d: the field ``d x a``. In the lens frame of a pixel at normalized image position
-    (x, y) that is up to about ``x y / 2`` radians away from the angle at which the sheet is mounted.
+    A sheet absorbs the field along its absorption axis a in the plane of the picture. It transmits the field
+    perpendicular to a and to the ray d, along ``d x a``. In the lens frame of a pixel at normalized image position
+    (x, y) its angle differs from the mounting angle by up to about ``x y / 2`` radians.
 
     Args:
         angle: angle of the transmission axis, radians counter-clockwise as displayed; a number or a tensor of one.
         rays: [..., 3] unit, camera axes.
 
     Returns:
-        [2, ...]: cosine and sine of twice the angle of the field that it passes, in the lens frame.
+        [2, ...]: cosine and sine of twice the angle of the transmitted field, in the lens frame.
     """
     theta = torch.as_tensor(angle, dtype=rays.dtype, device=rays.device)
     sine = torch.sin(theta)
     cosine = torch.cos(theta)
     x, y, z = rays.unbind(-1)
     # d x a with a = (-sin, -cos, 0): up in the picture is -y of the camera.
-    passed = z * cosine, -z * sine, y * sine - x * cosine
+    field = torch.stack((z * cosine, -z * sine, y * sine - x * cosine), dim=-1)
     right, up = lens_frame(rays)
-    field = torch.stack(passed, dim=-1)
     along = dot(field, right)
     across = dot(field, up)
     squared = (along * along + across * across).clamp(min=torch.finfo(rays.dtype).tiny)
@@ -188,11 +183,11 @@ def filter_analyzer(angle: float | Tensor, rays: Tensor) -> Tensor:
 
 @for_arrays
 def analyzer(angle: float | Tensor, rays: Tensor, mount: Mount = "sensor") -> Tensor:
-    """Analyzer of a polarizer at an angle: [2], or [2, ...] of a filter before the lens.
+    """Return the analyzer of a polarizer at an angle: [2], or [2, ...] for a filter before the lens.
 
     Args:
-        angle: radians, a number or a tensor of one. rays: [..., 3] unit, camera axes.
-        mount: where the polarizer is.
+        angle: radians, a number or a scalar tensor. rays: [..., 3] unit, camera axes.
+        mount: place of the polarizer.
     """
     if mount == "filter":
         return filter_analyzer(angle, rays)
@@ -202,17 +197,17 @@ def analyzer(angle: float | Tensor, rays: Tensor, mount: Mount = "sensor") -> Te
 
 @for_arrays
 def fitted_stokes(intensities: Tensor, analyzers: Tensor) -> Tensor:
-    """Least-squares Stokes vectors of intensities behind any analyzers.
+    """Fit Stokes vectors to intensities behind any analyzers by least squares.
 
     Args:
-        intensities: [K, ..., C] linear, on one exposure, with the colors last.
-        analyzers: [K, 2], or [K, 2, ...] of each pixel; (0, 0) for a picture without a polarizer.
+        intensities: [K, ..., C] linear, of the same exposure, with the colors last.
+        analyzers: [K, 2], or [K, 2, ...] for each pixel; (0, 0) for a picture without a polarizer.
 
     Returns:
         [3, ..., C], in the units of the intensities.
 
     Raises:
-        ValueError: there are not as many analyzers as intensities.
+        ValueError: the numbers of analyzers and intensities differ.
     """
     check_leading(intensities, len(analyzers), "intensities")
     ones = torch.ones_like(analyzers[:, :1])
@@ -226,16 +221,16 @@ def fitted_stokes(intensities: Tensor, analyzers: Tensor) -> Tensor:
 
 
 UNIFORM_SPREAD = math.pi / math.sqrt(12.0)
-"""Standard deviation of an angle about which nothing is known, in radians (52 degrees)."""
+"""Standard deviation of an unknown angle, in radians (52 degrees)."""
 
 
 class Uncertainty(NamedTuple):
-    """How well DoLP and AoLP are known.
+    """Uncertainty of DoLP and AoLP.
 
     Attributes:
-        dolp: [...] standard deviation of the DoLP; infinite where S0 <= 0.
-        aolp: [...] standard deviation of the AoLP, radians, at most ``UNIFORM_SPREAD``.
-        debiased: [...] DoLP in [0, 1] without what noise adds to it on average.
+        dolp: [...] standard deviation of the DoLP; infinite if S0 <= 0.
+        aolp: [...] standard deviation of the AoLP in radians, at most ``UNIFORM_SPREAD``.
+        debiased: [...] DoLP in [0, 1] without the mean contribution of noise.
     """
 
     dolp: Tensor
@@ -245,61 +240,49 @@ class Uncertainty(NamedTuple):
 
 @for_arrays
 def polarization_uncertainty(stokes: Tensor, variances: Tensor) -> Uncertainty:
-    """Standard deviations of DoLP and AoLP, and the DoLP debiased.
+    """Return standard deviations of DoLP and AoLP, and the debiased DoLP.
 
-    Noise makes a DoLP larger: unpolarized light measures as noise does. The debiased DoLP is the modified asymptotic
-    estimator ``d - b^2 (1 - exp(-d^2 / b^2)) / (2 d)`` with b the noise across the direction of polarization
+    Noise increases the DoLP: even unpolarized light has a positive measured one. The debiased DoLP is the modified
+    asymptotic estimator ``d - b^2 (1 - exp(-d^2 / b^2)) / (2 d)`` with b the noise across the direction of polarization
     (Plaszczynski, Montier, Levrier and Tristram 2014, "A novel estimator of the polarization amplitude from normally
-    distributed Stokes parameters", MNRAS 439, 4048), which is unbiased from about d = 2 b on. Of
-    unpolarized light it leaves four fifths of what noise makes: over a region, average Stokes vectors instead.
+    distributed Stokes parameters", MNRAS 439, 4048). It is unbiased for d of at least about 2 b. For unpolarized light
+    four fifths of the bias remain, so average Stokes vectors over regions instead.
 
     Args:
         stokes: [3, ...].
-        variances: [4, ...] of the four intensities in the order of ``ANGLES``, independent, squared units of
-            ``stokes``; or a shape that broadcasts to it.
+        variances: independent variances [4, ...] of the four intensities in the order of ``ANGLES``, in squared units
+            of ``stokes``; or a shape that broadcasts to it.
 
     Returns:
-        Uncertainty. To first order: good where the DoLP is over about three times its standard deviation. Without
-        any polarization the AoLP has ``UNIFORM_SPREAD``, and the spread of the DoLP is 0.66 of what is stated.
+        Uncertainty to first order, which is accurate if the DoLP exceeds about three standard deviations. For
+        unpolarized light the AoLP has ``UNIFORM_SPREAD``, and the true spread of the DoLP is 0.66 of the returned
+        one.
 
     Raises:
-        ValueError: the first axis of ``stokes`` is not 3 or that of ``variances`` not 4.
+        ValueError: the first axis of ``stokes`` is not 3, or the first axis of ``variances`` is not 4.
     """
-    check_leading(stokes, 3, "stokes")
     check_leading(variances, 4, "variances")
     v0, v45, v90, v135 = variances.unbind(0)
-    c, s, d, *scales = _direction(stokes)
-    half = d / 2
-    along = (c - half) ** 2 * v0 + (s - half) ** 2 * v45 + (c + half) ** 2 * v90 + (s + half) ** 2 * v135
-    across = s * s * (v0 + v90) + c * c * (v45 + v135)
-    return _uncertainty(d, along, across, *scales)
+    first = (v0 + v45 + v90 + v135) / 4, (v0 - v90) / 2, (v45 - v135) / 2
+    covariance = torch.stack((*first, v0 + v90, torch.zeros_like(v0), v45 + v135))
+    return fitted_uncertainty(stokes, covariance)
 
 
 @for_arrays
 def fitted_uncertainty(stokes: Tensor, covariance: Tensor) -> Uncertainty:
-    """``polarization_uncertainty`` of fitted Stokes vectors, by their covariance.
+    """Return ``polarization_uncertainty`` of fitted Stokes vectors for their covariance.
 
     Args:
         stokes: [3, ...].
-        covariance: [6, ...], of (S0, S0), (S0, S1), (S0, S2), (S1, S1), (S1, S2) and (S2, S2), squared units of
-            ``stokes``.
+        covariance: [6, ...] covariances (S0, S0), (S0, S1), (S0, S2), (S1, S1), (S1, S2) and (S2, S2), in squared
+            units of ``stokes``.
 
     Raises:
-        ValueError: the first axis of ``stokes`` is not 3 or that of ``covariance`` not 6.
+        ValueError: the first axis of ``stokes`` is not 3, or the first axis of ``covariance`` is not 6.
     """
     check_leading(stokes, 3, "stokes")
     check_leading(covariance, 6, "covariance")
     v00, v01, v02, v11, v12, v22 = covariance.unbind(0)
-    c, s, d, *scales = _direction(stokes)
-    along = c * c * v11 + 2 * c * s * v12 + s * s * v22 - 2 * d * (c * v01 + s * v02) + d * d * v00
-    across = s * s * v11 - 2 * s * c * v12 + c * c * v22
-    return _uncertainty(d, along.clamp(min=0), across.clamp(min=0), *scales)
-
-
-def _direction(stokes: Tensor) -> tuple[Tensor, ...]:
-    """Cosine and sine of twice the AoLP, of the first direction without polarization; the DoLP, 0 without light; where
-    light is polarized and where it is, and one over either intensity, 1 elsewhere.
-    """
     s0, s1, s2 = stokes.unbind(0)
     tiny = torch.finfo(s0.dtype).tiny
     square = s1 * s1 + s2 * s2
@@ -307,23 +290,19 @@ def _direction(stokes: Tensor) -> tuple[Tensor, ...]:
     inverse = torch.where(polarized, square, 1.0).rsqrt()
     lit = s0 > tiny
     scale = 1 / torch.where(lit, s0, 1.0)
+    # Cosine and sine of twice the AoLP, and the DoLP.
+    c = torch.where(polarized, s1 * inverse, 1.0)
+    s = s2 * inverse
     d = (torch.where(polarized, square * inverse, 0.0) * scale).clamp(max=1)
-    return torch.where(polarized, s1 * inverse, 1.0), s2 * inverse, d, polarized, lit, inverse, scale
-
-
-def _uncertainty(
-    d: Tensor, along: Tensor, across: Tensor, polarized: Tensor, lit: Tensor, inverse: Tensor, scale: Tensor
-) -> Uncertainty:
-    """From the DoLP, variances along and across the direction of polarization (along: of S0 times the DoLP), and the
-    last four of ``_direction``.
-    """
-    tiny = torch.finfo(d.dtype).tiny
+    # Variances of S0 times DoLP along the direction of polarization, and across it.
+    along = c * c * v11 + 2 * c * s * v12 + s * s * v22 - 2 * d * (c * v01 + s * v02) + d * d * v00
+    across = (s * s * v11 - 2 * s * c * v12 + c * c * v22).clamp(min=0)
     b2 = across * scale * scale
     ratio = (d * d / b2.clamp(min=tiny)).clamp(max=88.0)
-    removed = b2 * -torch.expm1(-ratio) / (2 * d.clamp(min=1e-12))
+    bias = b2 * -torch.expm1(-ratio) / (2 * d.clamp(min=1e-12))
     spread = torch.where(polarized, across.sqrt() * (inverse / 2), math.inf).clamp(max=UNIFORM_SPREAD)
     return Uncertainty(
-        torch.where(lit, along.sqrt() * scale, math.inf),
+        torch.where(lit, along.clamp(min=0).sqrt() * scale, math.inf),
         torch.where(lit, spread, UNIFORM_SPREAD),
-        torch.where(lit, (d - removed).clamp(min=0), 0.0),
+        torch.where(lit, (d - bias).clamp(min=0), 0.0),
     )

@@ -214,15 +214,11 @@ def changed_entry(before: Request, now: Request) -> tuple[str, str, str] | None:
 
     Locations of files do not matter.
     """
-    for part in ("file", "format", "model"):
-        old = getattr(before, part)
-        new = getattr(now, part)
-        if part == "format":
-            if old != new:
-                return part, old, new
-            continue
-        digests = all(stamp.digest for stamp in old.values())
-        old, new = (_comparable(files, digests=digests) for files in (old, new))
+    if before.format != now.format:
+        return "format", before.format, now.format
+    for part, files, now_files in (("file", before.file, now.file), ("model", before.model, now.model)):
+        digests = all(stamp.digest for stamp in files.values())
+        old, new = (_comparable(each, digests=digests) for each in (files, now_files))
         for key in sorted(old.keys() | new.keys()):
             if old.get(key) != new.get(key):
                 change = "removed" if key not in new else "changed" if key in old else "added"

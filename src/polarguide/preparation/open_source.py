@@ -5,7 +5,6 @@ Poses refer to the pictures as stored, or to the pictures that EXIF orientation 
 
 from __future__ import annotations
 
-import os
 import shlex
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -34,7 +33,7 @@ from polarguide.capture.view import ANGLES, listed
 from polarguide.core.errors import PolarguideError
 from polarguide.core.files import require_folder
 from polarguide.core.progress import Reporter
-from polarguide.core.text import stem_of
+from polarguide.core.text import command, stem_of
 from polarguide.preparation.filter_source import FilterSource, ShotsSource, SinglesSource
 from polarguide.preparation.settings import (
     FilterSettings,
@@ -98,8 +97,7 @@ def open_source(root: Path, settings: PrepareSettings) -> Source:
         kind = detect_dataset(root) or ("singles" if are_single_shots(root, settings) else "filter")
         if kind == "filter" and not angle_folders(root):
             shots = find_shots(root, nested=settings.sensor is None)
-            several = any(len(files) > 1 for files in shots.values())
-            kind = "filter" if several else "mosaic"
+            kind = "filter" if any(len(files) > 1 for files in shots.values()) else "mosaic"
             if kind == "mosaic" and settings.sensor is None:
                 _require_photographs(root)
                 kind = "singles"
@@ -188,20 +186,15 @@ def _require_photographs(root: Path) -> None:
     files = list(index_files(root, SHOT_SUFFIXES).values())
     if not files or index_files(root, tuple(set(RAW_SUFFIXES) - set(SHOT_SUFFIXES))):
         raise _unknown_layout(root)
-    gray = []  # raw mosaics are gray
     for path in (files[0], files[-1]):
-        if path.suffix.lower() in RAW_SUFFIXES:
-            pixels = decode_picture(path, read_picture(path))
-            if (pixels[..., 0] == pixels[..., 1]).all():
-                gray.append(path.name)
-    if gray:
-        raise PolarguideError(
-            root,
-            expected="photographs in color, or an option for gray pictures",
-            found=f"{gray[0]}, which is gray",
-            remedy=f"Raw mosaics: --sensor, one of {SENSOR_NAMES}. Ordinary photographs: --angles none. Shots through "
-            "a filter: --angles unknown, or angles in their names.",
-        )
+        if path.suffix.lower() in RAW_SUFFIXES and _is_gray(path):  # like raw mosaics
+            raise PolarguideError(
+                root,
+                expected="photographs in color, or an option for gray pictures",
+                found=f"{path.name}, which is gray",
+                remedy=f"Raw mosaics: --sensor, one of {SENSOR_NAMES}. Ordinary photographs: --angles none. Shots "
+                "through a filter: --angles unknown, or angles in their names.",
+            )
     numbered = numbered_like_angles(files)
     if numbered:
         raise PolarguideError(
@@ -220,6 +213,11 @@ def _require_photographs(root: Path) -> None:
             remedy=f"Specify the angles in their order, such as --angles {angles} --shots-per-view {each}. Ordinary "
             "photographs without a filter: --angles none.",
         )
+
+
+def _is_gray(path: Path) -> bool:
+    pixels = decode_picture(path, read_picture(path))
+    return bool((pixels[..., 0] == pixels[..., 1]).all())
 
 
 def frames_of_video(
@@ -270,8 +268,7 @@ def are_single_shots(root: Path, settings: PrepareSettings) -> bool:
     files = list_files(root, SHOT_SUFFIXES)
     if not files:
         return any(angle not in ANGLES for angle in folders_of_angles(root).values())
-    named = angles_of_names([stem_of(path) for path in files])
-    shots = [name for name in named if name is not None]
+    shots = [name for name in angles_of_names([stem_of(path) for path in files]) if name is not None]
     if any(angle not in ANGLES for _, angle in shots):
         return True
     return len({view for view, _ in shots}) == len(files)
@@ -281,28 +278,27 @@ def _unknown_layout(root: Path) -> PolarguideError:
     """Return the error for files without a recognizable format. It lists the files and the possible commands."""
     mosaics = index_files(root, RAW_SUFFIXES)
     folders = sorted(path.name for path in root.iterdir() if path.is_dir() and not path.name.startswith("."))
-    named = listed(sorted(path.name for path in mosaics.values()))
-    found = f"{len(mosaics)} pictures without angles in their names ({named})" if named else ""
-    found = " and ".join(part for part in (found, f"folders {listed(folders)}" if folders else "") if part)
-    out = f"--out {shlex.quote(root.resolve().name + '-scene')}"
-    source = shlex.quote(str(root))
+    names = listed(sorted(path.name for path in mosaics.values()))
+    contents = [f"{len(mosaics)} pictures without angles in their names ({names})"] if mosaics else []
+    contents += [f"folders {listed(folders)}"] if folders else []
+    prepare = command("prepare", root, "--out", f"{root.resolve().name}-scene")
     remedy = (
         "Four shots through a filter: name the folders 0, 45, 90 and 135, or the files <view>_0 to <view>_135, then "
-        f"polarguide prepare {source} {out}."
+        f"{prepare}."
     )
     if mosaics:
-        command = f"polarguide prepare {source} {out} --sensor IMX250MYR"
-        remedy = f"Raw mosaics: {command}, or yours of {SENSOR_NAMES}. {remedy}"
-    suffixes = SHOT_SUFFIXES + RAW_SUFFIXES
-    below = () if named else os.walk(root)
-    inside = (folder for folder, _, names in below if any(name.lower().endswith(suffixes) for name in names))
-    folder = next(inside, None)
-    if folder is not None:
-        remedy = f"Specify the folder of the pictures, such as {Path(folder)}. {remedy}"
+        remedy = f"Raw mosaics: {prepare} --sensor IMX250MYR, or your sensor of {SENSOR_NAMES}. {remedy}"
+    else:
+        suffixes = SHOT_SUFFIXES + RAW_SUFFIXES
+        inside = (path.parent for path in root.rglob("*") if path.name.lower().endswith(suffixes))
+        folder = next(inside, None)
+        remedy = (
+            remedy if folder is None else f"Specify the folder of the pictures, such as {folder}. {remedy}"
+        )
     return PolarguideError(
         root,
         expected="shots through a filter, raw mosaics with --sensor, or a published dataset",
-        found=found or "nothing to read",
+        found=" and ".join(contents) or "nothing to read",
         remedy=remedy,
     )
 
@@ -379,10 +375,9 @@ def known_poses(root: Path, pictures: Source, origin: str, poses_of: str = "auto
         def sizes(view: str) -> tuple[tuple[int, int], ...]:
             assumed.add(view)
             stored = pictures.stored(view if view in known else pictures.views[0])
-            sizes = stored.sizes
-            if poses_of == "displayed" and stored.orientation in QUARTER_TURNS:
-                sizes = (*sizes[1:2], *sizes[:1], *sizes[2:])  # rotated, stored, developed
-            return sizes
+            rotates = poses_of == "displayed" and stored.orientation in QUARTER_TURNS
+            original, *others = stored.sizes or ((0, 0),)
+            return (others[0], original, *others[1:]) if rotates and others else stored.sizes
 
         cameras, tests = read_parts(parts, pictures.views, sizes)
         poses = Poses.of_cameras(cameras, path, pictures.views, list(parts.values()))
@@ -396,15 +391,13 @@ def known_poses(root: Path, pictures: Source, origin: str, poses_of: str = "auto
 def _notes_of_parts(path: Path, parts: Mapping[str, Path], poses: Poses) -> tuple[str, ...]:
     """Return notes on the parts of a capture with poses."""
     if path.is_dir() and len(parts) > 1:
-        held = (
-            f"{len(poses.held_out)} views of {parts[TEST].name} are held out for tests."
-            if TEST in parts
-            else ""
-        )
-        return (f"Poses of {listed([file.name for file in parts.values()])}. {held}".strip(),)
-    beside = parts_of_poses(path.parent) if path.is_file() else {}
-    if path in beside.values() and len(beside) > 1 and poses.missing:
-        others = listed([file.name for file in beside.values() if file != path])
+        note = f"Poses of {listed([file.name for file in parts.values()])}."
+        if TEST in parts:
+            note += f" {len(poses.held_out)} views of {parts[TEST].name} are held out for tests."
+        return (note,)
+    siblings = parts_of_poses(path.parent) if path.is_file() else {}
+    if path in siblings.values() and len(siblings) > 1 and poses.missing:
+        others = listed([file.name for file in siblings.values() if file != path])
         return (f"{others} in the folder of {path.name}: --poses {shlex.quote(str(path.parent))} reads all.",)
     return ()
 

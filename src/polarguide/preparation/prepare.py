@@ -13,21 +13,18 @@ import re
 import shlex
 import shutil
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from polarguide import __version__
 from polarguide.capture.colmap.model import read_model
 from polarguide.capture.colmap.poses import Geometry, Poses, Undistortion
-from polarguide.capture.colmap.sfm import LEAST_VIEWS, NotConnectedError, reconstruct, tone_mapped
-from polarguide.capture.colmap.triangulate import add_points
-from polarguide.capture.exposures import Angle
+from polarguide.capture.colmap.sfm import LEAST_VIEWS, NotConnectedError, add_points, reconstruct, tone_mapped
 from polarguide.capture.filter.camera_files import TURNS
 from polarguide.capture.filter.consecutive import chosen_matching
 from polarguide.capture.raw_options import SampledOptions, changed
@@ -38,7 +35,7 @@ from polarguide.capture.write import (
     intensity_codes,
     picture_name,
     picture_names,
-    write_png,
+    write_png_file,
     write_view,
 )
 from polarguide.core.errors import PolarguideError
@@ -153,8 +150,7 @@ class SceneFolder:
             settings |= {name: now[name] for name in _POSE_SETTINGS}
         model = request.model if follows_none else before.request.model
         old = msgspec.structs.replace(before.request, settings=settings, model=model)
-        new = msgspec.structs.replace(request, settings=now)
-        difference = changed_entry(old, new)
+        difference = changed_entry(old, msgspec.structs.replace(request, settings=now))
         if difference is not None:
             name, was, is_now = difference
             raise PolarguideError(
@@ -244,27 +240,6 @@ class SceneFolder:
             )
         )
 
-    def write_view(
-        self,
-        view: str,
-        intensities: NDArray[np.float32],
-        invalid: NDArray[np.bool_],
-        record: ViewRecord,
-        mask: NDArray[np.bool_] | None = None,
-        angles: Sequence[Angle] = ANGLES,
-    ) -> None:
-        """Write the pictures of a view, then its record."""
-        record.files = write_view(
-            self.root,
-            view,
-            intensity_codes(intensities, invalid, getattr(self.measured, "rounding", EXACT)),
-            invalid,
-            mask,
-            angles,
-        )
-        self.views[view] = record
-        self.save()
-
     def drop(self, view: str) -> None:
         """Remove a view of an earlier call without poses."""
         for name in self.views.pop(view).files:
@@ -280,12 +255,12 @@ def _require_own_files(journal: Path, view: str, files: Iterable[str]) -> None:
     """
     pictures = re.compile(rf"polar/{re.escape(view)}_{_LABEL}\.png")
     own = {f"invalid/{view}.png", f"masks/{view}.png"}
-    strangers = sorted(name for name in set(files) - own if not pictures.fullmatch(name))
-    if strangers or "/" in view or "\\" in view or "\0" in view:
+    others = sorted(name for name in set(files) - own if not pictures.fullmatch(name))
+    if others or set(view) & set("/\\\0"):
         raise PolarguideError(
             f"{journal} (views, {shortened(view)})",
             expected=f"pictures of this view, {picture_name('VIEW', 0)} and so on",
-            found=shortened(strangers[0] if strangers else view),
+            found=shortened(others[0] if others else view),
             remedy=REMEDY,
         )
 
@@ -376,8 +351,8 @@ class PoseEstimation:
                 if view not in known or not path.exists():
                     done = develop_view(self._pictures, view, measured)
                     if done.mask is not None:
-                        write_png(masks / f"{view}.png", done.mask.astype(np.uint8) * 255)
-                    write_png(path, tone_mapped(done.intensities, self._settings.sfm_pictures))
+                        write_png_file(masks / f"{view}.png", done.mask.astype(np.uint8) * 255)
+                    write_png_file(path, tone_mapped(done.intensities, self._settings.sfm_pictures))
                     known[view] = done.record.geometry
                     self._folder.save()
                 advance(count)
@@ -440,12 +415,10 @@ def prepare_scene(
         PolarguideError: the source or a setting is invalid, ``out`` contains other files, or structure from motion does
             not connect the views. Then this call leaves no files in ``out``.
     """
-    settings = settings or PrepareSettings()
     reporter = reporter or Reporter()
-    root = Path(source)
     target = Path(out)
-    settings = settings.checked()
-    root, settings = frames_of_video(root, target, settings, reporter)
+    settings = (settings or PrepareSettings()).checked()
+    root, settings = frames_of_video(Path(source), target, settings, reporter)
     pictures = open_source(root, settings)
     settings = replace(settings, poses=origin_of_poses(pictures, settings.poses))
     if settings.poses != "sfm" and settings.intrinsics is not None:
@@ -479,15 +452,14 @@ def prepare_scene(
         reporter.say(f"{target} is already complete.")
         return _outcome(folder, pictures, settings, new=False)
     reporter.say(f"{len(pictures.views)} views, format {pictures.kind}.")
-    if frames:
-        reporter.say(frames)
-    for note in poses.notes if poses is not None else ():
-        reporter.say(note)
-    for warning in poses.warnings if poses is not None else ():
-        reporter.warn(warning)
-    unused = [name for name in POSE_NAMES if (root / name).exists()]
+    if poses is not None:
+        for note in filter(None, (frames, *poses.notes)):
+            reporter.say(note)
+        for warning in poses.warnings:
+            reporter.warn(warning)
+    unused = [f"--poses {shlex.quote(str(root / name))}" for name in POSE_NAMES if (root / name).exists()]
     if unused and settings.poses == "sfm":
-        options = " or ".join(f"--poses {shlex.quote(str(root / name))}" for name in unused)
+        options = " or ".join(unused)
         reporter.say(f"Poses by structure from motion. The folder also contains poses: use {options}.")
     if folder.state.measured is None:
         with reporter.track("measuring", len(pictures.views)) as advance:
@@ -594,16 +566,17 @@ def _write_views(folder: SceneFolder, pictures: Source, poses: Poses | None, rep
                 faults += view_faults
                 notes += view_notes
             advance(count)
-    for text in faults[:_NOTES]:
+    for text in _shorten(faults, "views are black, saturated or masked"):
         reporter.warn(text)
-    if len(faults) > _NOTES:
-        reporter.warn(
-            f"{len(faults) - _NOTES} more views are black, saturated or masked. {SCENE} lists their figures."
-        )
-    for note in notes[:_NOTES]:
-        reporter.say(note)
-    if len(notes) > _NOTES:
-        reporter.say(f"... and {len(notes) - _NOTES} more notes on views. {SCENE} lists their figures.")
+    for text in _shorten(notes, "notes on views"):
+        reporter.say(text)
+
+
+def _shorten(texts: list[str], others: str) -> list[str]:
+    """Return the first texts, and a sentence on the number of others."""
+    rest = len(texts) - _NOTES
+    more = [f"{rest} more {others}. {SCENE} lists their figures."] if rest > 0 else []
+    return [*texts[:_NOTES], *more]
 
 
 def _write_view(
@@ -620,7 +593,10 @@ def _write_view(
         intensities, invalid = warp.apply(intensities, invalid)
         mask = None if mask is None else warp.apply_mask(mask)
         record.warp = _warp_record(warp)
-    folder.write_view(view, intensities, invalid, record, mask, done.angles)
+    codes = intensity_codes(intensities, invalid, getattr(folder.measured, "rounding", EXACT))
+    record.files = write_view(folder.root, view, codes, invalid, mask, done.angles)
+    folder.views[view] = record
+    folder.save()
     faults = [] if mask is None or mask.any() else [f"{view}: its mask shows no object."]
     if record.clipped_share > MOSTLY:
         faults.append(f"{view}: {record.clipped_share:.0%} of its pixels are saturated.")

@@ -25,7 +25,7 @@ from polarguide.capture.raw_options import (
 from polarguide.capture.sensor.analyzers import is_analyzer_file
 from polarguide.core.errors import PolarguideError
 from polarguide.core.records import option_name
-from polarguide.core.text import decimals
+from polarguide.core.text import decimals, whole_number
 from polarguide.geometry.polarizer import ANGLES
 
 Dataset = Literal["pandora", "pisr", "nersp", "neisf", "gnerp", "phygap"]
@@ -205,24 +205,23 @@ class CalibrationOptions:
         Raises:
             PolarguideError: the file or the order is wrong.
         """
-        if self.calibration is None or self.analyzers() is not None:
-            calibration = Calibration()
-        else:
+        calibration = Calibration()
+        if self.calibration is not None and self.analyzers() is None:
             calibration = read_calibration(self.calibration)
-        if self.order is not None:
-            try:
-                first, second, third, fourth = (int(angle) for angle in self.order.split(","))
-            except ValueError:
-                raise PolarguideError(
-                    "--order",
-                    expected="four angles such as 90,45,0,135",
-                    found=repr(self.order),
-                    remedy="List the angles of the pictures named 0, 45, 90 and 135, in this order.",
-                ) from None
-            calibration = replace(calibration, order=(first, second, third, fourth))
-        if self.sense is not None:
-            calibration = replace(calibration, sense=self.sense)
-        return calibration if self.zero is None else replace(calibration, zero=self.zero)
+        changes = {"order": self._order(), "sense": self.sense, "zero": self.zero}
+        specified = {name: value for name, value in changes.items() if value is not None}
+        return replace(calibration, **specified)  # type: ignore[arg-type]
+
+    def _order(self) -> tuple[int, ...] | None:
+        angles = [whole_number(part.strip()) for part in (self.order or "").split(",")]
+        if self.order is not None and (None in angles or len(angles) != len(ANGLES)):
+            raise PolarguideError(
+                "--order",
+                expected="four angles such as 90,45,0,135",
+                found=repr(self.order),
+                remedy="List the angles of the pictures named 0, 45, 90 and 135, in this order.",
+            )
+        return None if self.order is None else tuple(angle for angle in angles if angle is not None)
 
     def analyzers(self) -> Path | None:
         """Return the file if polarguide calibrate wrote it, for ``PrepareSettings.analyzers``; else None."""

@@ -247,9 +247,7 @@ class StokesSource(Source):
         peaks: list[NDArray[np.float32]] = []
         outlines: list[OutlineAgreement] = []
         largest = 0.0
-        negative = 0
-        broken = 0
-        count = 0
+        counts = np.zeros(3, np.int64)
         for number, view in enumerate(self.views, 1):
             stokes, finite, _ = self._stokes(view)
             intensities = np.stack(four_intensities(stokes))
@@ -262,10 +260,9 @@ class StokesSource(Source):
                 outlines += [] if agreement is None else [agreement]
             peaks.append(peak.ravel()[:: max(1, peak.size // _SAMPLES)])
             largest = max(largest, float(peak.max()))
-            negative += int((intensities < 0).sum())
-            broken += int((~finite).sum())
-            count += peak.size
+            counts += (peak.size, (intensities < 0).sum(), (~finite).sum())
             advance(number)
+        count, negative, broken = counts.tolist()
         bright = float(np.percentile(np.concatenate(peaks), _BRIGHT))
         if not largest > 0:
             raise not_as_published(
@@ -405,21 +402,18 @@ class MosaicSource(Source):
         self._dataset = dataset
         self._mosaics = MosaicFiles(settings)
         self._settings = settings
-        self._dark_path = settings.dark_frame
         files = index_files(root, RAW_SUFFIXES)
-        if self._dark_path is not None:
-            dark = os.path.realpath(self._dark_path)
+        if settings.dark_frame is not None:
+            dark = os.path.realpath(settings.dark_frame)
             files = {view: path for view, path in files.items() if os.path.realpath(path) != dark}
         names = files.keys() if dataset is None else dataset.views
         self._files = {view: files[view] for view in sorted(names)}
         self.views = list(self._files)
         self.paths = list(self._files.values() if dataset is None else dataset.paths)
-        self.paths += [path for path in (self._dark_path, settings.analyzers) if path is not None]
-        self._crop = self._mosaics.crop
-        self._pattern = self._mosaics.pattern
+        self.paths += [path for path in (settings.dark_frame, settings.analyzers) if path is not None]
         self._white = white_gains(settings.white_balance)
         self._defective: NDArray[np.bool_] | None = None
-        if self._pattern.colors is None and settings.white_balance != "none":
+        if self._mosaics.pattern.colors is None and settings.white_balance != "none":
             raise PolarguideError(
                 "--white-balance",
                 expected="none for a monochrome sensor",
@@ -429,16 +423,18 @@ class MosaicSource(Source):
 
     def stored(self, view: str) -> Stored:
         """Return the size from the header of the mosaic, or from the settings."""
-        width = self._settings.width
-        height = self._settings.height
-        stated = None if width is None or height is None else (width, height)
-        size = stated_size(self._files[view]) or stated
-        if size is not None and self._settings.flip in QUARTER_FLIPS:
+        settings = self._settings
+        size = stated_size(self._files[view])
+        if size is None and settings.width is not None and settings.height is not None:
+            size = (settings.width, settings.height)
+        if size is not None and settings.flip in QUARTER_FLIPS:
             size = size[::-1]
-        step = DEMOSAIC_MODES[self._settings.demosaic]
+        step = DEMOSAIC_MODES[settings.demosaic]
         if size is None or step == 1:
             return Stored(size)
-        across, down = ((side - cut) // 2 * 2 // step for side, cut in zip(size, self._crop, strict=True))
+        across, down = (
+            (side - cut) // 2 * 2 // step for side, cut in zip(size, self._mosaics.crop, strict=True)
+        )
         return Stored(size, developed=(across, down))
 
     def measure(self, advance: Advance) -> MosaicMeasured:
@@ -463,7 +459,7 @@ class MosaicSource(Source):
             container, stated[path] = self._mosaics.depth(path, values)
             counts += np.bincount(values.ravel(), minlength=len(counts))
             cut = self._mosaics.cut(values)
-            samples.append(sample_blocks(cut, 2 * self._pattern.period))
+            samples.append(sample_blocks(cut, 2 * self._mosaics.pattern.period))
             blocks.append(sample_blocks(cut, SIDE))
             advance(count)
         assert shape is not None
@@ -502,8 +498,8 @@ class MosaicSource(Source):
             rounding = rounding_of(np.array([0.0, FULL_CODE * factor / ((1 << levels.bits) - 1)]))
         return MosaicMeasured(
             levels=levels,
-            pattern=tuple(self._pattern.rows()),
-            crop=self._crop,
+            pattern=tuple(self._mosaics.pattern.rows()),
+            crop=self._mosaics.crop,
             pair_ratio=ratio,
             gains=gains,
             analyzers=None if analyzers is None else analyzers.record(),
@@ -522,7 +518,7 @@ class MosaicSource(Source):
             mosaics = (
                 np.minimum(self._mosaics.cut(self._mosaics.read(path)), levels.white) for path in sample
             )
-            self._defective = defects(mosaics, self._pattern.period)
+            self._defective = defects(mosaics, self._mosaics.pattern.period)
         return self._defective
 
     def develop(self, view: str, measured: MosaicMeasured) -> DevelopedView:
@@ -538,7 +534,7 @@ class MosaicSource(Source):
         )
         settings = self._settings
         picture = demosaic(
-            linear, bad, self._pattern,
+            linear, bad, self._mosaics.pattern,
             mode=settings.demosaic, interpolation=settings.interpolation, registered=settings.register,
         )  # fmt: skip
         intensities = oriented(np.clip(picture.intensities, 0.0, 1.0), settings.calibration)
@@ -552,7 +548,7 @@ class MosaicSource(Source):
                 invalid_share=round(float(picture.invalid.mean()), 6),
                 geometry=Geometry(
                     (stored.shape[1], stored.shape[0]),
-                    self._crop,
+                    self._mosaics.crop,
                     DEMOSAIC_MODES[settings.demosaic],
                     (width, height),
                 ),

@@ -19,6 +19,7 @@ from polarguide.raster.interface import (
     check_shapes,
     not_finite,
     refusal,
+    some_channels,
 )
 
 
@@ -52,15 +53,6 @@ def finite(*splats: Tensor) -> list[Tensor]:
     return inputs
 
 
-def _chosen(picture: Tensor, channels: tuple[int, ...]) -> Tensor:
-    """Copy some channels of a picture."""
-    first = channels[0]
-    last = channels[-1]
-    if channels == tuple(range(first, last + 1)):  # a slice is several times as fast as an index
-        return picture[..., first : last + 1].contiguous()
-    return picture[..., list(channels)]
-
-
 class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(
@@ -82,7 +74,7 @@ class _Rasterize(torch.autograd.Function):
         ctx.rasterizer = rasterizer
         ctx.statistic = statistic
         ctx.still = still
-        return out, alpha, radii, _chosen(out, still) if still else None
+        return out, alpha, radii, some_channels(out, still).contiguous() if still else None
 
     @staticmethod
     @once_differentiable
@@ -111,7 +103,10 @@ def rasterize_cpu(
     check_shapes(splats, statistic, still)
     for name, tensor in splats._asdict().items():
         if tensor.dtype != torch.float32 or tensor.device.type != "cpu":
-            found = f"{tensor.dtype} on {tensor.device}"
-            remedy = "Convert it, or use rasterize_reference."
-            raise refusal(name, "float32 on the CPU", found, remedy)
+            raise refusal(
+                name,
+                "float32 on the CPU",
+                f"{tensor.dtype} on {tensor.device}",
+                "Convert the tensor, or use rasterize_reference.",
+            )
     return Rasterized(*applied(_Rasterize, camera, statistic, still, *splats))

@@ -26,7 +26,15 @@ from torch.autograd.function import once_differentiable
 
 from polarguide.core.errors import PolarguideError, install_extra
 from polarguide.geometry.camera import Camera
-from polarguide.raster.interface import BLUR, NEAR_PLANE, Rasterized, ScreenStatistic, Splats, check_shapes
+from polarguide.raster.interface import (
+    BLUR,
+    NEAR_PLANE,
+    Rasterized,
+    ScreenStatistic,
+    Splats,
+    check_shapes,
+    some_channels,
+)
 
 TILE = 16
 """Side of a tile in pixels."""
@@ -34,13 +42,6 @@ NOTICE_SECONDS = 5.0
 """Seconds of loading after which the kernels are certainly compiled."""
 COMPILED = (1, 2, 3, 4, 5, 8, 9, 16, 17, 32, 33)
 """Numbers of channels up to 33 that both versions compile; 1.5.3 pads others, 1.6.0 refuses them."""
-
-
-class _View(NamedTuple):
-    """Camera as input of gsplat: [1, 4, 4] world-to-camera, [1, 3, 3] intrinsics."""
-
-    viewmats: Tensor
-    intrinsics: Tensor
 
 
 class _Projected(NamedTuple):
@@ -60,15 +61,17 @@ class _Projected(NamedTuple):
     radii: Tensor
 
 
-_views: WeakKeyDictionary[Camera, dict[torch.device, _View]] = WeakKeyDictionary()
+_views: WeakKeyDictionary[Camera, dict[torch.device, tuple[Tensor, Tensor]]] = WeakKeyDictionary()
 
 
-def _view(camera: Camera, device: torch.device) -> _View:
-    """Return the camera on a device. It is cached for each camera, so that further renderings copy nothing."""
+def _view(camera: Camera, device: torch.device) -> tuple[Tensor, Tensor]:
+    """Return [1, 4, 4] world-to-camera and [1, 3, 3] intrinsics on a device, which are cached for each camera."""
     by_device = _views.setdefault(camera, {})
     if device not in by_device:
-        matrices = (camera.world_to_camera, camera.intrinsics)
-        by_device[device] = _View(*(t[None].to(device, torch.float32) for t in matrices))
+        pose, intrinsics = (
+            t[None].to(device, torch.float32) for t in (camera.world_to_camera, camera.intrinsics)
+        )
+        by_device[device] = pose, intrinsics
     return by_device[device]
 
 
@@ -93,7 +96,7 @@ def load_gsplat(say: Callable[[str], None]) -> None:
         raise PolarguideError(
             "--device cuda",
             expected="the package gsplat",
-            found="no such package",
+            found="package not installed",
             remedy=f"Install it with {install_extra('cuda')} and repeat the command, or use --device cpu.",
         )
     notice = "compiling gsplat's CUDA kernels; this takes minutes, once for each machine and PyTorch ..."
@@ -139,21 +142,15 @@ def _no_kernels(found: str) -> PolarguideError:
     )
 
 
-def _gsplat() -> Any:
-    return importlib.import_module("gsplat")
-
-
 def _project(splats: Splats, camera: Camera) -> _Projected:
-    gsplat = _gsplat()
+    gsplat = importlib.import_module("gsplat")
     size = (camera.width, camera.height)
-    view = _view(camera, splats.means.device)
     radii, means2d, depths, conics, _ = gsplat.fully_fused_projection(
         splats.means,
         None,
         splats.rotations,
         splats.scales,
-        view.viewmats,
-        view.intrinsics,
+        *_view(camera, splats.means.device),
         *size,
         eps2d=BLUR,
         near_plane=NEAR_PLANE,
@@ -173,7 +170,7 @@ def _blend(projected: _Projected, features: Tensor, camera: Camera) -> tuple[Ten
     padding = next(count for count in COMPILED if count >= channels) - channels
     if padding:
         features = torch.cat((features, features.new_zeros(features.shape[0], padding)), dim=1)
-    picture, alpha = _gsplat().rasterize_to_pixels(
+    picture, alpha = importlib.import_module("gsplat").rasterize_to_pixels(
         projected.means2d,
         projected.conics,
         features[None],
@@ -241,30 +238,15 @@ def _blend_with_statistic(
 
     own = projected.means2d.clone()
     own.register_hook(fill)
-    picture, alpha = _blend(projected._replace(means2d=own), _channels(features, chosen), camera)
+    picture, alpha = _blend(projected._replace(means2d=own), some_channels(features, chosen), camera)
     if others:
-        rest, alpha = _blend(projected, _channels(features, others), camera)
+        rest, alpha = _blend(projected, some_channels(features, others), camera)
         picture = torch.cat((picture, rest), dim=-1)
     else:
         inputs = (projected.means2d, projected.conics, projected.opacities)
         alpha = _AlphaAlone.apply(*inputs, alpha, projected, camera)
-    return _sorted_channels(picture, chosen + others), alpha
-
-
-def _channels(features: Tensor, chosen: list[int]) -> Tensor:
-    """Return some channels of [N, D] without an index, which would be copied to the device."""
-    first = chosen[0]
-    last = chosen[-1] + 1
-    if chosen == list(range(first, last)):
-        return features[:, first:last]
-    return torch.stack([features[:, channel] for channel in chosen], dim=1)
-
-
-def _sorted_channels(picture: Tensor, channels: list[int]) -> Tensor:
-    """Sort the last axis of a picture, which has these channels, by channel."""
-    if channels == sorted(channels):
-        return picture
-    return torch.stack([picture[..., channels.index(k)] for k in range(len(channels))], dim=-1)
+    places = [(chosen + others).index(channel) for channel in range(features.shape[1])]
+    return some_channels(picture, places), alpha
 
 
 def rasterize_cuda(
@@ -285,6 +267,6 @@ def rasterize_cuda(
     if still:
         # A separate blend, because gsplat's kernel has one gradient for all channels.
         unmoved = _Projected(*(t.detach() for t in projected))
-        again, _ = _blend(unmoved, _channels(splats.features, list(still)), camera)
+        again, _ = _blend(unmoved, some_channels(splats.features, still), camera)
     radii = projected.radii[0].amax(dim=-1).to(splats.means.dtype)
     return Rasterized(picture, alpha, radii, again)

@@ -12,6 +12,7 @@ background is 0.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
@@ -132,14 +133,31 @@ def check_shapes(splats: Splats, statistic: ScreenStatistic | None, still: tuple
     shapes = ((count, 3), (count, 4), (count, 3), (count,), (count, channels))
     for name, tensor, shape in zip(Splats._fields, splats, shapes, strict=True):
         if tuple(tensor.shape) != shape:
-            remedy = "Pass tensors with one entry for each Gaussian."
-            raise refusal(name, f"shape {list(shape)}", str(list(tensor.shape)), remedy)
+            raise refusal(
+                name,
+                f"shape {list(shape)}",
+                str(list(tensor.shape)),
+                "Pass tensors with one entry for each Gaussian.",
+            )
     if not 1 <= channels <= 32:
         raise refusal("features", "1 to 32 channels", str(channels), "Split the channels.")
     for name, chosen in (("statistic", statistic.channels if statistic else ()), ("still", still)):
         if len(set(chosen)) < len(chosen) or not all(0 <= channel < channels for channel in chosen):
-            remedy = "Specify existing channels, each once."
-            raise refusal(name, f"different channels below {channels}", str(chosen), remedy)
+            raise refusal(
+                name,
+                f"different channels below {channels}",
+                str(chosen),
+                "Specify existing channels, each once.",
+            )
+
+
+def some_channels(values: Tensor, channels: Sequence[int]) -> Tensor:
+    """Return some channels of [..., D]: a slice if possible, and no index, which would be copied to the device."""
+    first = channels[0]
+    end = first + len(channels)
+    if list(channels) == list(range(first, end)):
+        return values[..., first:end]
+    return torch.stack([values[..., channel] for channel in channels], dim=-1)
 
 
 def not_finite(name: str, index: int) -> PolarguideError:

@@ -97,7 +97,7 @@ def report_polarizers(out: Path, scene: Scene, polarizers: Polarizers, reporter:
         if chosen:
             reporter.warn(f"{named(chosen)} {fault}")
     specified = [judgment for judgment in judgments if judgment.specified.angle is not None]
-    if specified and all(judgment.limit >= LARGEST_DIFFERENCE for judgment in specified):
+    if specified and all(judgment.estimate.limit >= LARGEST_DIFFERENCE for judgment in specified):
         reporter.say(
             f"known angles were not checked: the model predicts polarization too poorly (pictures look "
             f"{specified[0].usual:.0f} degrees off in the median). "

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -67,7 +67,7 @@ def splatting(
     Raises:
         ValueError: the degree or a shape does not fit.
     """
-    core = [gaussians[name] for name in _CORE]
+    core = [gaussians[name] for name in CORE_SHAPES]
     means, quaternions, log_scales = core[:3]
     pose = camera.pose(means.dtype, means.device)
     outward = gaussians.get("outward") if normals else None
@@ -76,7 +76,8 @@ def splatting(
     layout = channel_slices(widths)
     if native and own.color is None and fits(*core, outward, *own[:-1], *own.further.values()):
         forward = pose.rotation[2].contiguous() if depth else None
-        settings = SplattingSettings(sh_degree, pose.center.contiguous(), forward, normals)
+        settings = {"degree": sh_degree, "center": pose.center.contiguous(), "forward": forward}
+        settings |= {"normals": normals, "grazing": GRAZING}
         further = torch.cat([*own.further.values()], dim=1) if own.further else None
         tensors = applied(_Splatting, settings, *core, outward, *own[1:-1], further)
         return Splats(*tensors), layout
@@ -88,7 +89,6 @@ def splatting(
     return splats(gaussians, torch.cat([values[name] for name in widths], dim=1)), layout
 
 
-_CORE = ("means", "quaternions", "log_scales", "opacity_logits", "sh_dc", "sh_rest")
 _INPUTS = (
     "means",
     "quaternions",
@@ -108,28 +108,14 @@ _UNTRAINED = ("outward", "metalness")
 """Tensors of the native pass without a gradient."""
 
 
-class SplattingSettings(NamedTuple):
-    """Arguments of the native pass other than the parameters of Gaussians.
-
-    Attributes:
-        degree: degree of the base color's harmonics. center: [3] of the camera.
-        forward: [3] direction of the camera depth; None: no depth. normals: whether to splat normals.
-    """
-
-    degree: int
-    center: Tensor
-    forward: Tensor | None
-    normals: bool
-
-
 class _Splatting(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, settings: SplattingSettings, *tensors: Tensor | None) -> tuple[Tensor, ...]:
+    def forward(ctx: Any, settings: dict[str, Any], *tensors: Tensor | None) -> tuple[Tensor, ...]:
         inputs: dict[str, Any] = dict(zip(_INPUTS, tensors, strict=True))
         means = inputs["means"]
         quaternions = inputs["quaternions"]
         inputs = {name: None if t is None else t.detach().contiguous() for name, t in inputs.items()}
-        kernel = _native.Splatting(**inputs, **settings._asdict(), grazing=GRAZING)
+        kernel = _native.Splatting(**inputs, **settings)
         outputs = {
             "scales": torch.empty_like(inputs["log_scales"]),
             "opacities": torch.empty_like(inputs["opacity_logits"]),
@@ -157,7 +143,7 @@ class _Splatting(torch.autograd.Function):
             for name in _INPUTS
             if name not in _UNTRAINED
         }
-        kernel = _native.Splatting(**inputs, **ctx.settings._asdict(), grazing=GRAZING)
+        kernel = _native.Splatting(**inputs, **ctx.settings)
         kernel.backward(**outputs, **by, **{f"to_{name}": gradient for name, gradient in to.items()})
         return None, *(to.get(name) for name in _INPUTS)
 

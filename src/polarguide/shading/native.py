@@ -94,57 +94,59 @@ _METAL = ["share", "reflected", "slope"]
 class _Reflect(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, features: Tensor, rays: Tensor, given: ReflectArguments, *textures: Tensor
+        ctx: Any, features: Tensor, rays: Tensor, arguments: ReflectArguments, *textures: Tensor
     ) -> tuple[Tensor, ...]:
         features, rays, *levels = (t.detach().contiguous() for t in (features, rays, *textures))
         learns = any(ctx.needs_input_grad)
         directions = torch.empty_like(rays) if learns else None
         level = rays.new_empty(len(rays)) if learns else None
-        seen = torch.empty_like(rays) if learns else None
+        looked_up = torch.empty_like(rays) if learns else None
         outputs: dict[str, Any] = {name: torch.empty_like(rays) for name in _LAYERS}
         _native.reflect_forward(
             features,
             rays,
             levels,
-            **given.shading,
-            **given.level,
+            **arguments.shading,
+            **arguments.level,
             directions=directions,
             level=level,
-            seen=seen,
+            seen=looked_up,
             **outputs,
         )
         light = None
         reflected: dict[str, Any] = {}
-        if given.metal is not None:
+        if arguments.metal is not None:
             light = outputs["reflection"]
-            count = len(given.metal.pixels)
+            count = len(arguments.metal.pixels)
             reflected = {name: rays.new_empty(count, 3) for name in _METAL}
             reflected["share"] = rays.new_empty(count)
             lobes = {name: outputs[name] for name in ("final", "specular")}
-            _native.metal_layers(features, rays, **given.metal._asdict(), light=light, **reflected, **lobes)
+            _native.metal_layers(
+                features, rays, **arguments.metal._asdict(), light=light, **reflected, **lobes
+            )
             ctx.mark_non_differentiable(reflected["share"])
-        ctx.given = given
+        ctx.arguments = arguments
         ctx.set_materialize_grads(False)
         if learns:
-            ctx.save_for_backward(features, rays, directions, level, seen, light, *levels)
-        if given.detached:
+            ctx.save_for_backward(features, rays, directions, level, looked_up, light, *levels)
+        if arguments.detached:
             outputs |= {name: outputs[name.removeprefix("detached_")].clone() for name in DETACHED}
         return *outputs.values(), *reflected.values()
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
-        features, rays, directions, level, seen, light, *levels = ctx.saved_tensors
-        given: ReflectArguments = ctx.given
+        features, rays, directions, level, looked_up, light, *levels = ctx.saved_tensors
+        arguments: ReflectArguments = ctx.arguments
         contiguous = (None if grad is None else grad.contiguous() for grad in grads)
-        by = dict(zip(given.outputs, contiguous, strict=True))
+        by = dict(zip(arguments.outputs, contiguous, strict=True))
         by_detached = [by.get(name) for name in DETACHED]
         to_features = torch.empty_like(features)
-        to_seen = torch.empty_like(seen)
-        # Gradients through the detached layers reach the light, but not the normals by way of the directions.
-        to_texels = None if all(grad is None for grad in by_detached) else torch.empty_like(seen)
+        to_looked_up = torch.empty_like(looked_up)
+        # Gradients of the detached layers reach the light, but not the normals through the directions.
+        to_texels = None if all(grad is None for grad in by_detached) else torch.empty_like(looked_up)
         to_light = by["reflection"]
-        metal = given.metal
+        metal = arguments.metal
         if metal is not None:
             to_light = torch.zeros_like(rays) if to_light is None else to_light.clone()
             to_normal = rays.new_empty(len(metal.pixels), 3)
@@ -166,15 +168,15 @@ class _Reflect(torch.autograd.Function):
         _native.reflect_backward_layers(
             features,
             rays,
-            seen,
-            **given.shading,
+            looked_up,
+            **arguments.shading,
             grad_final=by["final"],
             grad_specular=by["specular"],
             grad_diffuse=by["diffuse"],
             grad_reflection=to_light,
             grad_held_specular=by_detached[0],
             grad_held_diffuse=by_detached[1],
-            grad_seen=to_seen,
+            grad_seen=to_looked_up,
             grad_texels=to_texels,
             grad_features=to_features,
         )
@@ -183,12 +185,12 @@ class _Reflect(torch.autograd.Function):
             to_features[:, metal.first : metal.first + 4].index_add_(0, metal.pixels, to_metal)
         learns_light = any(ctx.needs_input_grad[3:])
         to_directions, to_level, to_textures = mips_backward(
-            levels, directions, level, to_seen, learns_light, to_texels
+            levels, directions, level, to_looked_up, learns_light, to_texels
         )
         _native.reflect_backward_directions(
             features,
             rays,
-            **given.level,
+            **arguments.level,
             grad_directions=to_directions,
             grad_level=to_level,
             grad_features=to_features,
@@ -205,7 +207,7 @@ def world_rays_native(camera: Camera) -> Tensor:
 
 
 def reflect_native(
-    features: Tensor, rays: Tensor, textures: Sequence[Tensor], given: ReflectArguments
+    features: Tensor, rays: Tensor, textures: Sequence[Tensor], arguments: ReflectArguments
 ) -> tuple[Tensor, ...]:
     """Shade a G-buffer by deferred reflection (Ye et al. 2024, Eq. 5, or Fresnel-weighted).
 
@@ -215,7 +217,7 @@ def reflect_native(
         features: [P, D] blended base color, normal, strength and, with ``local``, light; other channels may follow.
         rays: [P, 3] unit, world.
         textures: mip levels of the light from afar, [6, R, R, 3] each: radiance with ``fresnel``, else one raw level.
-        given: arguments of the shading.
+        arguments: arguments of the shading.
 
     Returns:
         ``final``, ``specular``, ``diffuse`` and ``reflection``, each [P, 3], differentiable in features and textures.
@@ -226,7 +228,7 @@ def reflect_native(
     Raises:
         ValueError: a shape does not fit.
     """
-    layers: tuple[Tensor, ...] = applied(_Reflect, features, rays, given, *textures)
+    layers: tuple[Tensor, ...] = applied(_Reflect, features, rays, arguments, *textures)
     return layers
 
 
@@ -243,18 +245,18 @@ def shade_native(
     layout = splatted.layout
     features = splatted.features.flatten(0, 1)
     index_channel = first_channel(layout, "index")
-    given = ReflectArguments(fresnel, local, refractive_index, index_channel, detached=splatted.detached)
+    arguments = ReflectArguments(fresnel, local, refractive_index, index_channel, detached=splatted.detached)
     if "blur" in layout:
         alpha = splatted.alpha.detach().flatten()
-        given = given._replace(blur_channel=first_channel(layout, "blur"), blur=LEVELS, alpha=alpha)
+        arguments = arguments._replace(blur_channel=first_channel(layout, "blur"), blur=LEVELS, alpha=alpha)
     if "reflectance" in layout:
         first = first_channel(layout, "reflectance")
-        given = given._replace(metal=MetalArguments(where_metal(features, first), first))
-    outputs = reflect_native(features, world_rays_native(camera), textures, given)
-    shaded = dict(zip(given.outputs, outputs, strict=True))
+        arguments = arguments._replace(metal=MetalArguments(where_metal(features, first), first))
+    outputs = reflect_native(features, world_rays_native(camera), textures, arguments)
+    shaded = dict(zip(arguments.outputs, outputs, strict=True))
     metal = None
-    if given.metal is not None:
-        metal = MetalPixels(given.metal.pixels, *(shaded.pop(name) for name in _METAL))
+    if arguments.metal is not None:
+        metal = MetalPixels(arguments.metal.pixels, *(shaded.pop(name) for name in _METAL))
     size = splatted.alpha.shape
     return {**{name: layer.unflatten(0, size) for name, layer in shaded.items()}, "metal": metal}
 

@@ -1,7 +1,7 @@
-"""Dense grids over a cube, one a resolution, whose interpolated values are linear in what they learn.
+"""Dense grids over a cube, one for each resolution. Their interpolated values are linear in their parameters.
 
-Value and slope of a grid at a point are weighted sums of the same few nodes, so that a loss on slopes (on normals)
-reaches the nodes without differentiating anything twice.
+Value and gradient of a grid at a point are weighted sums of the same few nodes. A loss on gradients (on normals)
+therefore reaches the nodes without a second derivative.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 
 class _Gather(torch.autograd.Function):
-    """``out[n, q, c] = sum over k of weights[n, q, k] table[nodes[n, k], c]``; a gradient goes to the table alone."""
+    """``out[n, q, c] = sum over k of weights[n, q, k] table[nodes[n, k], c]``, differentiable in the table alone."""
 
     @staticmethod
     def forward(ctx: Any, table: Tensor, nodes: Tensor, weights: Tensor) -> Tensor:
@@ -28,7 +28,7 @@ class _Gather(torch.autograd.Function):
         nodes, weights = ctx.saved_tensors
         spread = torch.bmm(weights.transpose(1, 2), grad)
         table = grad.new_zeros(ctx.shape)
-        if ctx.shape[1] == 1:  # far faster on the CPU than rows of one
+        if ctx.shape[1] == 1:  # on the CPU much faster than rows of one
             table.view(-1).scatter_add_(0, nodes.flatten(), spread.flatten())
         else:
             table.index_add_(0, nodes.flatten(), spread.view(-1, ctx.shape[1]))
@@ -36,10 +36,10 @@ class _Gather(torch.autograd.Function):
 
 
 class SmoothGrids(nn.Module):
-    """A scalar as a sum of quadratic B-splines on several grids: once continuously differentiable.
+    """A scalar as a sum of quadratic B-splines on several grids, once continuously differentiable, initially zero.
 
     Args:
-        resolutions: cells along a side of the cube [-1, 1]^3, one grid each. All start at zero.
+        resolutions: cells of each grid along a side of the cube [-1, 1]^3.
     """
 
     def __init__(self, resolutions: Sequence[int]) -> None:
@@ -48,21 +48,21 @@ class SmoothGrids(nn.Module):
         self.levels = nn.ParameterList(torch.zeros((n + 2) ** 3, 1) for n in resolutions)
 
     def forward(self, places: Tensor) -> tuple[Tensor, Tensor]:
-        """Values [N] and slopes [N, 3] at places [N, 3]; what lies outside the cube counts as on its surface."""
+        """Return values [N] and gradients [N, 3] at places [N, 3]. Places are clamped to the cube."""
         sums = torch.zeros(len(places), 4, 1, dtype=places.dtype, device=places.device)
         for resolution, table in zip(self.resolutions, self.levels, strict=True):
-            nodes, weights = spline_weights(places, resolution)
-            sums = sums + _Gather.apply(table, nodes, weights)
+            sums = sums + _Gather.apply(table, *spline_weights(places, resolution))
         return sums[:, 0, 0], sums[:, 1:, 0]
 
 
 class FeatureGrids(nn.Module):
-    """Features as trilinear interpolations on several grids, side by side.
+    """Features as concatenated trilinear interpolations on several grids.
 
     Args:
-        resolutions: cells along a side of the cube [-1, 1]^3, one grid each.
-        channels: channels of each. spread: half-width of the uniform first values.
-        generator: they are drawn from.
+        resolutions: cells of each grid along a side of the cube [-1, 1]^3.
+        channels: channels of each grid.
+        spread: half-width of the uniform initial values.
+        generator: source of the initial values.
     """
 
     def __init__(
@@ -75,7 +75,7 @@ class FeatureGrids(nn.Module):
         self.width = channels * len(self.resolutions)
 
     def forward(self, places: Tensor) -> Tensor:
-        """Features [N, width] at places [N, 3]; what lies outside the cube counts as on its surface."""
+        """Return features [N, width] at places [N, 3]. Places are clamped to the cube."""
         features = []
         for resolution, table in zip(self.resolutions, self.levels, strict=True):
             nodes, weights = linear_weights(places, resolution)
@@ -84,57 +84,54 @@ class FeatureGrids(nn.Module):
 
 
 def spline_weights(places: Tensor, resolution: int) -> tuple[Tensor, Tensor]:
-    """The 27 nodes [N, 27] around each place [N, 3], and their weights [N, 4, 27] in the value and the three slopes.
+    """Return the 27 nodes [N, 27] around each place [N, 3], and their weights [N, 4, 27] for value and gradient.
 
-    Along an axis, a place t in [0, 1] of the way through its cell has the weights (1 - t)^2 / 2, 1/2 + t - t^2 and
-    t^2 / 2 of the cell before it, its own and the next one. A grid has a layer of nodes around the cube for that.
+    Let t in [0, 1] be the position of a place in its cell along an axis. The previous, the own and the next cell have
+    the weights (1 - t)^2 / 2, 1/2 + t - t^2 and t^2 / 2. A grid therefore has a layer of nodes around the cube.
     """
     cell, t = _cell(places, resolution)
     nodes = _nodes(cell, resolution + 2, 3)
-    weight = _quadratic(t)
     slope = torch.stack((t - 1, 1 - 2 * t, t), dim=-1) * (0.5 * resolution)
-    wx, wy, wz = weight.unbind(1)
+    wx, wy, wz = _quadratic(t).unbind(1)
     sx, sy, sz = slope.unbind(1)
     across = _outer(wy, wz)
-    along_y = _outer(sy, wz)
-    along_z = _outer(wy, sz)
-    rows = (_outer(wx, across), _outer(sx, across), _outer(wx, along_y), _outer(wx, along_z))
+    rows = (_outer(wx, across), _outer(sx, across), _outer(wx, _outer(sy, wz)), _outer(wx, _outer(wy, sz)))
     return nodes, torch.stack(rows, dim=1)
 
 
 def spline_matrix(axis: Tensor, resolution: int) -> Tensor:
-    """Weights [M, resolution + 2] of a grid's nodes along one axis, at places [M] on it."""
+    """Return weights [M, resolution + 2] of a grid's nodes along one axis, at places [M] on it."""
     cell, t = _cell(axis, resolution)
     nodes = cell.long()[:, None] + torch.arange(3, device=axis.device)
     return axis.new_zeros(len(axis), resolution + 2).scatter_(1, nodes, _quadratic(t))
 
 
 def linear_weights(places: Tensor, resolution: int) -> tuple[Tensor, Tensor]:
-    """The 8 nodes [N, 8] around each place [N, 3], and their weights [N, 8]."""
+    """Return the 8 nodes [N, 8] around each place [N, 3], and their weights [N, 8]."""
     cell, t = _cell(places, resolution)
     wx, wy, wz = torch.stack((1 - t, t), dim=-1).unbind(1)
     return _nodes(cell, resolution + 1, 2), _outer(wx, _outer(wy, wz))
 
 
 def _quadratic(t: Tensor) -> Tensor:
-    """Weights [..., 3] of a quadratic B-spline at t [...] of the way through a cell."""
+    """Return weights [..., 3] of a quadratic B-spline at positions t [...] in a cell."""
     return torch.stack((0.5 * (1 - t) ** 2, 0.5 + t - t * t, 0.5 * t * t), dim=-1)
 
 
 def _cell(places: Tensor, resolution: int) -> tuple[Tensor, Tensor]:
-    """Cell [...] of each place along an axis, a whole number, and how far through it the place is, in [0, 1]."""
+    """Return the cell [...] of each place along an axis, a whole number, and the position in it, in [0, 1]."""
     scaled = (0.5 * resolution) * (places.clamp(-1, 1) + 1)
     cell = scaled.floor().clamp(max=resolution - 1)
     return cell, scaled - cell
 
 
 def _nodes(cell: Tensor, side: int, reach: int) -> Tensor:
-    """Numbers of the nodes from each cell on, ``reach`` along each axis, in a grid with ``side`` of them."""
+    """Return indices of nodes, beginning at each cell, ``reach`` along each axis, in a grid with ``side`` of them."""
     steps = torch.tensor([(x * side + y) * side + z for x, y, z in product(range(reach), repeat=3)])
     x, y, z = cell.long().unbind(1)
     return ((x * side + y) * side + z)[:, None] + steps.to(cell.device)
 
 
 def _outer(a: Tensor, b: Tensor) -> Tensor:
-    """Products [N, J K] of weights [N, J] and [N, K]."""
+    """Return products [N, J K] of weights [N, J] and [N, K]."""
     return (a[:, :, None] * b[:, None, :]).flatten(1)

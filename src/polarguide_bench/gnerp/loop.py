@@ -1,6 +1,6 @@
-"""The loop that trains a field: one view a step, some hundred rays of it, compared with color, DoLP and AoLP.
+"""Training loop of a field. A step compares several hundred rays of one view with color, DoLP and AoLP.
 
-The loss terms are GNeRP's (Li et al. 2024): color, angle of polarization, eikonal, and the guidance by covariances.
+The loss terms are those of GNeRP (Li et al. 2024): color, angle of polarization, eikonal, and guidance by covariances.
 """
 
 from __future__ import annotations
@@ -27,25 +27,27 @@ from polarguide_bench.gnerp.state import FieldState
 
 
 def color_loss(predicted: Tensor, measured: Tensor, dolp: Tensor) -> Tensor:
-    """Mean of ``(1 - DoLP) |difference|`` of shown colors [N, 3], DoLP [N]."""
+    """Return the mean of ``(1 - DoLP) |difference|`` of display colors [N, 3], with DoLP [N]."""
     return ((1 - dolp)[:, None] * (predicted - measured).abs()).mean()
 
 
 def aolp_loss(normal: Tensor, rays: Tensor, aolp: Tensor, dolp: Tensor, *, circular: bool) -> Tensor:
-    """Mean of DoLP times the difference of the predicted angle of polarization from the measured one.
+    """Return the mean of DoLP times the difference between the predicted and the measured angle of polarization.
 
-    The prediction is that of specular light: perpendicular to the plane of incidence, that is the azimuth of the
-    blended normal about the ray plus 90 degrees, modulo 180.
+    The prediction holds for specular light, which is polarized perpendicular to the plane of incidence. It is the
+    azimuth of the blended normal about the ray plus 90 degrees, modulo 180.
 
     Args:
-        normal: [N, 3] blended, camera axes, any length. rays: [N, 3] unit, camera axes.
-        aolp: [N] radians in [0, pi), in the lens frame. dolp: [N] in [0, 1].
-        circular: ``(1 - cos 2 difference) / 2``; else, as published, the difference of the numbers in [0, pi), which
-            jumps where one of them passes 180 degrees.
+        normal: blended normals [N, 3] in camera axes, of any length.
+        rays: [N, 3] in camera axes, unit length.
+        aolp: [N] radians in [0, pi), in the lens frame.
+        dolp: [N] in [0, 1].
+        circular: use ``(1 - cos 2 difference) / 2``. Otherwise use the published difference of numbers in [0, pi),
+            which jumps if one of them passes 180 degrees.
     """
     right, up = _across(normal, rays)
     if circular:
-        # cos and sin of twice the azimuth without the azimuth; 90 degrees more turn the sign.
+        # cos and sin of twice the azimuth, without the azimuth itself. Adding 90 degrees flips the sign.
         square = (right * right + up * up).clamp(min=1e-12)
         cosine = (up * up - right * right) / square
         sine = -2 * right * up / square
@@ -58,7 +60,7 @@ def aolp_loss(normal: Tensor, rays: Tensor, aolp: Tensor, dolp: Tensor, *, circu
 
 
 def eikonal_loss(slopes: Tensor) -> Tensor:
-    """Mean of ``(|slope| - 1)^2`` over slopes [..., 3]."""
+    """Return the mean of ``(|gradient| - 1)^2`` over gradients [..., 3]."""
     return ((dot(slopes, slopes) + 1e-12).sqrt() - 1).square().mean()
 
 
@@ -66,63 +68,67 @@ def guidance_loss(
     normals: Tensor, around: Tensor, weights: Tensor, rays: Tensor, aolp: Tensor, neighbors: Tensor,
     dolp: Tensor, *, circular: bool,
 ) -> Tensor:  # fmt: skip
-    """L1 of the covariance of normals around a ray's samples, splatted into the picture, from that of the AoLP.
+    """Return the L1 distance between the covariances of normals around a ray's samples and of the AoLP.
 
-    A sample has six neighbors; the covariance of their normals about its own is projected on the plane across the
-    ray, [2, 2], and blended along it. That of the picture is of ``(sin, -cos)`` of the AoLP at four pixels about that
-    of the ray's own, times the squared length of the blended normal across the ray. As published, (sin, -cos) turns
-    its sign where the AoLP passes 180 degrees, and the normal does not; ``circular`` doubles the angles of both.
+    A sample has six neighbors. The covariance of their normals about its own normal is projected to the plane
+    perpendicular to the ray, [2, 2], and blended along the ray.
+
+    The covariance of the picture is that of ``(sin, -cos)`` of the AoLP at four pixels about the vector of the ray's
+    own pixel. It is multiplied by the squared length of the blended normal perpendicular to the ray. In the published
+    term, ``(sin, -cos)`` flips its sign if the AoLP passes 180 degrees, but the normal does not. ``circular`` doubles
+    the angles of both.
 
     Args:
-        normals: [N, K, 3] unit, camera axes, of the samples. around: [N, K, 6, 3] of their neighbors.
-        weights: [N, K] of the samples in the picture. rays: [N, 3] unit, camera axes.
-        aolp: [N] radians. neighbors: [N, 4] of the neighboring pixels. dolp: [N] weight of each ray.
+        normals: normals [N, K, 3] of the samples in camera axes, unit length.
+        around: normals [N, K, 6, 3] of their neighbors.
+        weights: weights [N, K] of the samples in the picture.
+        rays: [N, 3] in camera axes, unit length.
+        aolp: [N] radians.
+        neighbors: AoLP [N, 4] of the neighboring pixels.
+        dolp: weight [N] of each ray.
+        circular: double the angles.
     """
     own = torch.stack(_across(normals, rays[:, None]), dim=-1)
     others = torch.stack(_across(around, rays[:, None, None]), dim=-1)
     length = (weights[..., None] * own).sum(dim=1).square().sum(dim=-1)
-    field = _vectors(aolp, circular)
-    weight = weights[..., None, None]
+    pixel, pixels = (
+        torch.stack((torch.sin(angle), -torch.cos(angle)), dim=-1) for angle in (aolp, neighbors)
+    )
     if circular:
-        own = _doubled(own)
-        others = _doubled(others)
-    predicted = (weight * _covariance(own, others)).sum(dim=1)
-    measured = length[:, None, None] * _covariance(field, _vectors(neighbors, circular))
+        own, others, pixel, pixels = map(_doubled, (own, others, pixel, pixels))
+    predicted = (weights[..., None, None] * _covariance(own, others)).sum(dim=1)
+    measured = length[:, None, None] * _covariance(pixel, pixels)
     return (dolp[:, None, None] * (predicted - measured).abs()).mean()
 
 
 def _across(vectors: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
-    """Components of vectors along the lens frame of rays, image right and image up."""
+    """Return components of vectors in the lens frame of rays, image right and image up."""
     right, up = lens_frame(rays)
     return dot(vectors, right), dot(vectors, up)
 
 
-def _vectors(aolp: Tensor, circular: bool) -> Tensor:
-    """The normal [..., 2] across the ray that an AoLP stands for, or that with twice its angle."""
-    normal = torch.stack((torch.sin(aolp), -torch.cos(aolp)), dim=-1)
-    return _doubled(normal) if circular else normal
-
-
 def _doubled(vectors: Tensor) -> Tensor:
-    """Vectors [..., 2] with twice their angle, and the same length."""
+    """Double the angles of vectors [..., 2] without changing their lengths."""
     x, y = vectors.unbind(-1)
     length = (x * x + y * y + 1e-12).sqrt()
     return torch.stack(((x * x - y * y) / length, 2 * x * y / length), dim=-1)
 
 
 def _covariance(own: Tensor, others: Tensor) -> Tensor:
-    """[..., 2, 2] of vectors [..., M, 2] about [..., 2], over M - 1."""
+    """Return the covariance [..., 2, 2] of vectors [..., M, 2] about [..., 2], divided by M - 1."""
     apart = others - own[..., None, :]
     return apart.transpose(-1, -2) @ apart / (others.shape[-2] - 1)
 
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """Of one view, row by row: P = H W pixels.
+    """Target of a view in row-major order, with P = H W pixels.
 
     Attributes:
-        picture: shown colors [P, 3]. dolp: [P] in [0, 1], 0 where nothing is known of the polarization.
-        aolp: [P] radians in [0, pi), in the lens frame. valid: numbers of the pixels that count, [V].
+        picture: display colors [P, 3].
+        dolp: [P] in [0, 1], 0 for unknown polarization.
+        aolp: [P] radians in [0, pi), in the lens frame.
+        valid: indices [V] of the valid pixels.
     """
 
     picture: Tensor
@@ -132,7 +138,7 @@ class Target:
 
 
 def target_of(view: View, store: ViewStore, device: torch.device) -> Target:
-    """The target of a view, computed once and stored as two bytes a value."""
+    """Return the target of a view. It is computed once and stored with two bytes per value."""
 
     def make() -> Entry:
         entry = {"picture": packed(srgb_encode(view.photograph().clamp(0, 1)).to(device))}
@@ -146,31 +152,34 @@ def target_of(view: View, store: ViewStore, device: torch.device) -> Target:
 
     stored = store.get("target", view.name, make)
     picture = stored_values(stored["picture"]).view(-1, 3)
-    nothing = torch.zeros(len(picture), device=device)
+    zeros = torch.zeros(len(picture), device=device)
     degree, angle = (
-        stored_values(stored[name]).flatten() if name in stored else nothing for name in ("dolp", "aolp")
+        stored_values(stored[name]).flatten() if name in stored else zeros for name in ("dolp", "aolp")
     )
-    valid = stored["valid"].codes.flatten() if "valid" in stored else nothing == 0
+    valid = stored["valid"].codes.flatten() if "valid" in stored else zeros == 0
     return Target(picture, degree, torch.remainder(angle, torch.pi), valid.nonzero()[:, 0])
 
 
 MAP_EVERY = 16
-"""Steps after which the map of distances is brought up to date."""
+"""Steps between updates of the map of distances."""
 GLANCE = (0.3, 0.7)
-"""Shares of the steps between which the color comes to depend on the direction: before, it has to be explained by the
-place, so that a wrong surface cannot be painted with what each view sees."""
+"""Shares of the steps between which the weight of the direction in the color rises from 0 to 1.
+
+Before, the color depends on the place alone, so that a wrong surface cannot imitate each view."""
 DIAGONAL = ((-1, -1), (-1, 1), (1, -1), (1, 1))
-"""Neighbors of a pixel: rows and columns."""
+"""Neighbors of a pixel as offsets of rows and columns."""
 
 
 class FieldLoop(Loop):
-    """Trains a neural recipe on a scene.
+    """Loop that trains a neural recipe on a scene.
 
     Args:
-        scene: the capture. recipe: the method. settings: the user's settings, one view a step.
-        device: to compute on.
-        state: state to resume from, on the device; None: from the beginning.
-        store: cache of the targets of the views; None: in memory.
+        scene: the scene.
+        recipe: the recipe.
+        settings: settings of the training, with one view per step.
+        device: device of the training.
+        state: state on the device to resume from; None: a new training.
+        store: cache of the targets; None: in memory.
     """
 
     state: FieldState
@@ -193,9 +202,10 @@ class FieldLoop(Loop):
         self._store = store or ViewStore()
 
     def optimize(self) -> tuple[Tensor, str, None]:
-        """March some rays of a view, and change the field by their loss."""
+        """Do one optimizer step with rays of one view."""
         state = self.state
         settings = self.settings
+        sampling = self.recipe.sampling
         field = state.field
         share = state.step / settings.steps
         generator = seeded(settings.seed, 9, state.step)
@@ -204,22 +214,25 @@ class FieldLoop(Loop):
         self.whole = False
         if state.step % MAP_EVERY == 0:
             field.map_distances()
-        field.direction_share.fill_(_ramp(share, *GLANCE))
-        drawn = torch.randint(len(target.valid), (self.recipe.sampling.rays,), generator=generator)
+        begin, end = GLANCE
+        field.direction_share.fill_(min(1.0, max(0.0, (share - begin) / (end - begin))))
+        drawn = torch.randint(len(target.valid), (sampling.rays,), generator=generator)
         pixels = target.valid[drawn.to(self._device)]
-        origin, rays = self._rays(view.camera, pixels)
-        sampling = self.recipe.sampling
-        marched = march(field, origin, view.camera.to_world(rays), sampling, generator=generator)
-        color = color_loss(marched.color, target.picture[pixels], target.dolp[pixels])
+        rays = view.camera.rays(device=self._device).view(-1, 3)[pixels]
+        center = field.region.inner(view.camera.pose(rays.dtype, self._device).center)
+        marched = march(
+            field, center.expand(len(rays), 3), view.camera.to_world(rays), sampling, generator=generator
+        )
+        picture = target.picture[pixels]
+        color = color_loss(marched.color, picture, target.dolp[pixels])
         loss = self._loss(color, marched, view.camera, rays, pixels, target, share)
         self._set_rates(share)
         loss.backward()
         state.optimizer.step(dict(field.named_parameters()))
         with torch.no_grad():
-            # Fog is where grids would begin; a surface never gets thicker than it was at first.
+            # Grids tend to start with fog. The sharpness therefore never falls below its initial value.
             field.log_sharpness.clamp_(min=field.first_log_sharpness)
-            squared = (marched.color - target.picture[pixels]).square().mean()
-            psnr = -10 * torch.log10(squared.clamp(min=1e-10))
+            psnr = -10 * torch.log10((marched.color - picture).square().mean().clamp(min=1e-10))
         if state.step + 1 == settings.steps:
             field.map_distances()
         stage = "color and angles" if share < self.recipe.weights.guided else "guided"
@@ -236,12 +249,11 @@ class FieldLoop(Loop):
         share: float,
     ) -> Tensor:
         weights = self.recipe.weights
-        dolp = target.dolp[pixels]
-        aolp = target.aolp[pixels]
         loss = weights.color * color + weights.eikonal * eikonal_loss(marched.slopes)
         if weights.aolp:
             normal = camera.to_camera(marched.normal)
-            angles = aolp_loss(normal, rays, aolp, dolp, circular=weights.circular)
+            dolp = target.dolp[pixels]
+            angles = aolp_loss(normal, rays, target.aolp[pixels], dolp, circular=weights.circular)
             loss = loss + weights.aolp * angles
         if weights.guidance and share >= weights.guided:
             loss = loss + weights.guidance * self._guidance(marched, camera, rays, pixels, target)
@@ -250,30 +262,30 @@ class FieldLoop(Loop):
     def _guidance(
         self, marched: RaySamples, camera: Camera, rays: Tensor, pixels: Tensor, target: Target
     ) -> Tensor:
-        """The published Gaussians of normals, at the heaviest samples of each ray."""
-        heaviest = marched.weights.detach().topk(self.recipe.sampling.neighbors, dim=1).indices
-        index = heaviest[..., None].expand(-1, -1, 3)
-        around = self._neighbors(marched, camera, rays, heaviest)
+        """Return the guidance at the samples with the largest weights of each ray."""
+        largest = marched.weights.detach().topk(self.recipe.sampling.neighbors, dim=1).indices
+        index = largest[..., None].expand(-1, -1, 3)
+        around = self._neighbors(marched, camera, rays, largest)
         normals = unit(self.state.field.geometry(around.view(-1, 3)).slope).view(around.shape)
         row = pixels // camera.width
         column = pixels % camera.width
-        beside = [
+        neighbors = [
             (row + dy).clamp(0, camera.height - 1) * camera.width + (column + dx).clamp(0, camera.width - 1)
             for dy, dx in DIAGONAL
         ]
         return guidance_loss(
             camera.to_camera(marched.normals.gather(1, index)),
             camera.to_camera(normals),
-            marched.weights.gather(1, heaviest),
+            marched.weights.gather(1, largest),
             rays,
             target.aolp[pixels],
-            target.aolp[torch.stack(beside, dim=1)],
+            target.aolp[torch.stack(neighbors, dim=1)],
             target.dolp[pixels],
             circular=self.recipe.weights.circular,
         )
 
     def _neighbors(self, marched: RaySamples, camera: Camera, rays: Tensor, chosen: Tensor) -> Tensor:
-        """Places [N, K, 6, 3] around chosen samples [N, K]: four a pixel away both ways, two along the ray."""
+        """Return places [N, K, 6, 3] around samples [N, K]: four at diagonal pixels, two along the ray."""
         places = marched.places.gather(1, chosen[..., None].expand(-1, -1, 3))
         width = (marched.along.gather(1, chosen) / camera.fx)[..., None]
         pose = camera.pose(places.dtype, places.device)
@@ -283,23 +295,15 @@ class FieldLoop(Loop):
         steps = [dy * down + dx * right for dy, dx in DIAGONAL]
         return torch.stack([places + step for step in (*steps, ahead, -ahead)], dim=2)
 
-    def _rays(self, camera: Camera, pixels: Tensor) -> tuple[Tensor, Tensor]:
-        """Origin [N, 3] in the field's coordinates, and directions in camera axes."""
-        region = self.state.field.region
-        device = self._device
-        rays = camera.rays(device=device).view(-1, 3)[pixels]
-        center = region.inner(camera.pose(rays.dtype, device).center)
-        return center.expand(len(rays), 3), rays
-
     def _view_of(self, place: int) -> View:
-        """The view at a place in the sequence of all views: every epoch visits each once, in a new order."""
+        """Return the view at a place in the sequence of all views. Each epoch visits each view once, in a new order."""
         views = self.scene.train_views
         epoch, place = divmod(place, len(views))
         order = torch.randperm(len(views), generator=seeded(self.settings.seed, 4, epoch))
         return views[int(order[place])]
 
     def _set_rates(self, share: float) -> None:
-        """Rates of this step: linear warm-up, then a cosine."""
+        """Set the rates of this step: a linear warm-up, then a cosine."""
         rates = self.recipe.rates
         shape = self.recipe.shape
         late = max(0.0, (share - rates.warmup) / (1 - rates.warmup))
@@ -315,8 +319,3 @@ class FieldLoop(Loop):
             else:
                 own = rates.sharpness if name == "log_sharpness" else rates.networks
             optimizer.rates[name] = own * rising * falling
-
-
-def _ramp(share: float, begin: float, end: float) -> float:
-    """From 0 to 1 between two shares of the steps."""
-    return min(1.0, max(0.0, (share - begin) / (end - begin)))

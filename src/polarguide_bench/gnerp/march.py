@@ -6,25 +6,26 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from polarguide.geometry.vectors import dot, unit
-from polarguide_bench.gnerp.field import Field, Geometry
+from polarguide_bench.gnerp.field import Field
 from polarguide_bench.gnerp.recipe import Sampling
 
 DIFFUSE_SHARE = 0.1
-"""Of the probability with which samples are drawn, what is spread evenly over a ray."""
+"""Share of the sampling probability that is uniform along a ray."""
 FIRST_SHARPNESS = 16.0
-"""Largest sharpness for the first search, so that samples lie before and behind the surface."""
+"""Largest sharpness of the first search. Samples must lie on both sides of the surface."""
 SECOND_SHARPNESS = 64.0
-"""Largest sharpness for the second search."""
+"""Largest sharpness of the second search."""
 TRACED = 64
 """Steps of sphere tracing."""
 STRIDE = 0.9
-"""Share of the distance that a step goes, since the distance is not exact."""
+"""Step length over the distance, which is not exact."""
 HIT = 0.01
-"""Distance that counts as a hit, in the unit of the region."""
+"""Largest distance of a hit, in the unit of the region."""
 BEHIND_SCALE = 8.0
-"""Length of the background's way to infinity, in the unit that its density counts in."""
+"""Optical length of the background, from the sphere to infinity."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,9 +33,12 @@ class RaySamples:
     """Samples of N rays, S each.
 
     Attributes:
-        color: shown colors [N, 3] with what lies behind.
-        along: [N, S] of each sample along its ray. weights: [N, S] of each in the picture. places: [N, S, 3].
-        slopes: [N, S, 3] of the field there. normals: their directions.
+        color: display colors [N, 3] with the background.
+        along: distances [N, S] along the rays.
+        weights: weights [N, S] in the picture.
+        places: coordinates [N, S, 3] of the field.
+        slopes: gradients [N, S, 3] of the field.
+        normals: directions [N, S, 3] of the gradients.
     """
 
     color: Tensor
@@ -46,17 +50,17 @@ class RaySamples:
 
     @property
     def opacity(self) -> Tensor:
-        """[N] of the surface."""
+        """Opacity [N] of the surface."""
         return self.weights.sum(dim=1)
 
     @property
     def distance(self) -> Tensor:
-        """[N] expected along the ray, over the opacity."""
+        """Expected distance [N] along the ray, over the opacity."""
         return (self.weights * self.along).sum(dim=1) / self.opacity.clamp(min=1e-6)
 
     @property
     def normal(self) -> Tensor:
-        """[N, 3] blended, up to length 1."""
+        """Blended normal [N, 3], not longer than 1."""
         return (self.weights[..., None] * self.normals).sum(dim=1)
 
 
@@ -68,13 +72,14 @@ def march(
     *,
     generator: torch.Generator | None = None,
 ) -> RaySamples:
-    """Look along rays.
+    """Sample a field along rays.
 
     Args:
-        field: what is looked at.
-        origin, direction: [N, 3] in the field's coordinates, direction of unit length.
-        sampling: how many samples.
-        generator: moves the samples within their strata; None: they lie in the middle.
+        field: the field.
+        origin: [N, 3] in coordinates of the field.
+        direction: [N, 3], unit length.
+        sampling: number of samples.
+        generator: source of random positions in strata. None: samples at the centers.
     """
     count = len(origin)
     fine = sampling.fine
@@ -85,9 +90,9 @@ def march(
     places = origin[:, None] + along[..., None] * direction[:, None]
     flat = places.view(-1, 3)
     rays = direction[:, None].expand(-1, fine, -1).reshape(-1, 3)
-    geometry: Geometry = field.geometry(flat)
+    geometry = field.geometry(flat)
     normals = unit(geometry.slope)
-    # The color does not bend normals: grids would paint with bumps.
+    # The color has no gradient in normals: grids would imitate texture with bumps.
     colors = field.color(flat, rays, normals.detach(), geometry.features).view(count, fine, 3)
     falling = dot(rays, geometry.slope).view(count, fine).clamp(max=0)
     distance = geometry.distance.view(count, fine)
@@ -102,9 +107,12 @@ def march(
 
 
 def trace(field: Field, origin: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
-    """Sphere tracing (Hart 1996): where rays first meet the zero set, [N], and whether they do, [N] bool.
+    """Find the first intersections of rays with the surface by sphere tracing (Hart 1996).
 
-    By the field's map at first; the last steps ask the field itself.
+    The first steps use the field's map, the last ones the field itself.
+
+    Returns:
+        Distances [N] along the rays, and a mask [N] of the hits.
     """
     begin, end = field.region.span(origin, direction)
     along = begin
@@ -118,7 +126,7 @@ def trace(field: Field, origin: Tensor, direction: Tensor) -> tuple[Tensor, Tens
 
 
 def section_opacity(first: Tensor, last: Tensor) -> Tensor:
-    """Opacity of sections of a ray with the scaled distances ``s f`` at their ends (NeuS, Eq. 13)."""
+    """Return the opacity of sections of a ray from the scaled distances ``s f`` at their ends (NeuS, Eq. 13)."""
     entering = torch.sigmoid(first)
     leaving = torch.sigmoid(last)
     return ((entering - leaving) / (entering + 1e-5)).clamp(0, 1)
@@ -133,7 +141,7 @@ def _samples(
     sampling: Sampling,
     generator: torch.Generator | None,
 ) -> Tensor:
-    """Where the fine samples [N, S] of each ray lie, in order: where the field's map says that it is opaque."""
+    """Return sorted positions [N, S] of the fine samples, concentrated where the field's map is opaque."""
 
     def near(along: Tensor) -> Tensor:
         return field.near_distance(origin[:, None] + along[..., None] * direction[:, None])
@@ -152,7 +160,7 @@ def _samples(
 
 
 def _map_weights(along: Tensor, distance: Tensor, sharpness: float) -> Tensor:
-    """Weights of the sections between samples [N, C], with a share for surfaces that the map may have missed."""
+    """Return weights of the sections between samples [N, C], with a share for surfaces that the map misses."""
     step = (along[:, 1:] - along[:, :-1]).clamp(min=1e-6)
     middle = 0.5 * (distance[:, 1:] + distance[:, :-1])
     half = 0.5 * (distance[:, 1:] - distance[:, :-1]).minimum(torch.zeros_like(step)).maximum(-10 * step)
@@ -164,7 +172,7 @@ def _map_weights(along: Tensor, distance: Tensor, sharpness: float) -> Tensor:
 
 
 def _strata(rays: int, count: int, like: Tensor, generator: torch.Generator | None) -> Tensor:
-    """One number in each of ``count`` equal parts of [0, 1], for each ray: [N, count]."""
+    """Return a number in each of ``count`` equal parts of [0, 1], for each ray: [N, count]."""
     part = torch.arange(count, dtype=like.dtype, device=like.device)
     if generator is None:
         return ((part + 0.5) / count).expand(rays, -1)
@@ -172,19 +180,20 @@ def _strata(rays: int, count: int, like: Tensor, generator: torch.Generator | No
 
 
 def _inverse(edges: Tensor, weight: Tensor, share: Tensor) -> Tensor:
-    """Where the integral of a density, constant between edges [N, E], reaches shares [N, C] of its whole."""
+    """Return positions at which the integral of a density reaches shares [N, C] of its total.
+
+    The density is constant between edges [N, E].
+    """
     total = torch.cumsum(weight, dim=1)
     total = torch.cat((torch.zeros_like(total[:, :1]), total), dim=1) / total[:, -1:]
     place = torch.searchsorted(total, share.contiguous(), right=True).clamp(1, weight.shape[1])
-    low = total.gather(1, place - 1)
-    high = total.gather(1, place)
-    first = edges.gather(1, place - 1)
-    last = edges.gather(1, place)
+    low, first = (values.gather(1, place - 1) for values in (total, edges))
+    high, last = (values.gather(1, place) for values in (total, edges))
     return first + (last - first) * ((share - low) / (high - low).clamp(min=1e-9)).clamp(0, 1)
 
 
 def _sections(along: Tensor, begin: Tensor, end: Tensor, longest: Tensor) -> tuple[Tensor, Tensor]:
-    """From each sample [N, S] to where its section begins and ends, halfway to its neighbors but not far."""
+    """Return offsets from each sample [N, S] to the ends of its section, halfway to its neighbors, with a limit."""
     middle = 0.5 * (along[:, 1:] + along[:, :-1])
     before = torch.cat((begin[:, None], middle), dim=1) - along
     after = torch.cat((middle, end[:, None]), dim=1) - along
@@ -194,16 +203,15 @@ def _sections(along: Tensor, begin: Tensor, end: Tensor, longest: Tensor) -> tup
 def _behind(
     field: Field, origin: Tensor, direction: Tensor, count: int, generator: torch.Generator | None
 ) -> Tensor:
-    """Shown colors [N, 3] of what lies behind the cameras' sphere; the last sample, at infinity, is opaque."""
-    radius = field.region.radius
+    """Return display colors [N, 3] of the background behind the cameras' sphere. The last sample is opaque."""
     share = _strata(len(origin), count, origin, generator)
-    reach = radius / (1 - share).clamp(min=1e-4)
+    reach = field.region.radius / (1 - share).clamp(min=1e-4)
     middle = -dot(origin, direction)[:, None]
     nearest = dot(origin, origin)[:, None] - middle**2
     along = middle + (reach**2 - nearest).clamp(min=0).sqrt()
     places = origin[:, None] + along[..., None] * direction[:, None]
     density, colors = field.background(field.region.surroundings(places.view(-1, 3)))
     through = torch.exp(-density.view(-1, count)[:, :-1] * (BEHIND_SCALE / count)).cumprod(dim=1)
-    through = torch.nn.functional.pad(torch.nn.functional.pad(through, (1, 0), value=1.0), (0, 1))
+    through = pad(pad(through, (1, 0), value=1.0), (0, 1))
     weights = through[:, :-1] - through[:, 1:]
     return (weights[..., None] * colors.view(-1, count, 3)).sum(dim=1)

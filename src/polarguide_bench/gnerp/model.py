@@ -1,12 +1,8 @@
-"""A trained field: it renders the layers that scores and reports need.
-
-The surface of a field: the zero set of its signed distance.
-"""
+"""Model of a trained field: it renders the layers for scores and reports, and extracts the surface."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -17,46 +13,38 @@ from polarguide.geometry.scene_frame import scene_frame
 from polarguide.optics.color import srgb_decode
 from polarguide.results.rendering.mesh import COARSE, Box, Surface, box_around, zero_surface
 from polarguide.shading.result import RenderResult
-from polarguide_bench.gnerp.field import Field
 from polarguide_bench.gnerp.march import march, trace
 from polarguide_bench.gnerp.recipe import NeuralRecipe
 from polarguide_bench.gnerp.state import FieldState
 
 CHUNK = 4096
-"""Rays at a time."""
-
-
-class _RayPixels(NamedTuple):
-    """Of N rays: shown color [N, 3], normal [N, 3], opacity [N], and distance [N]."""
-
-    color: Tensor
-    normal: Tensor
-    opacity: Tensor
-    distance: Tensor
+"""Batch size, in rays."""
 
 
 class FieldModel:
-    """A trained field: a signed distance and colors.
+    """A trained field of signed distance and color.
 
     Args:
-        state: state of the training. recipe: the method. device: where layers are rendered.
+        state: state of the training.
+        recipe: recipe of the training.
+        device: device of the rendering.
     """
 
     def __init__(self, state: FieldState, recipe: NeuralRecipe, device: torch.device) -> None:
         self.state = state
         self.recipe = recipe
         self.device = device
-        self.field: Field = state.field
+        self.field = state.field
         self.field.map_distances()
 
     @property
     def steps(self) -> int:
-        """How many steps it has been trained for."""
+        """Number of training steps."""
         return self.state.step
 
     @property
     def gaussians(self) -> None:
-        """It has none."""
+        """None: a field has no Gaussians."""
 
     @torch.no_grad()
     def render(
@@ -67,29 +55,32 @@ class FieldModel:
         depth: bool = False,
         surface: bool = False,
     ) -> RenderResult:
-        """All layers; ``depth`` only on request.
+        """Render the layers of a view.
 
         Args:
-            camera: any. normals: they come with the colors. surface: its depth is that of the surface in any case.
+            camera: the camera.
+            normals: add normals.
+            depth: add the depth.
+            surface: unused. The depth is always that of the surface.
         """
-        batches = [self._ray_pixels(*rays, depth) for rays in self._rays(camera)]
+        batches = [self._render_rays(*rays, depth) for rays in self._rays(camera)]
         color, normal, opacity, distance = (torch.cat(parts) for parts in zip(*batches, strict=True))
         size = (camera.height, camera.width)
         final = srgb_decode(color).view(*size, 3)
-        rays = camera.rays(device=self.device)
         layers = {"final": final, "base": final, "alpha": opacity.view(size)}
         if normals:
             layers["normal"] = normal.view(*size, 3)
         if depth:
+            rays = camera.rays(device=self.device)
             layers["depth"] = distance.view(size) * rays[..., 2] * self.field.region.unit
         return RenderResult(layers)
 
     def stokes(self, result: RenderResult, camera: Camera) -> None:
-        """It predicts an angle of polarization, and no Stokes vector."""
+        """Return None: a field predicts an angle of polarization, but no Stokes vector."""
 
     @torch.no_grad()
     def alpha_in_front(self, camera: Camera, depth: Tensor) -> Tensor:
-        """Share of each pixel's opacity [H, W] that lies nearer than a depth [H, W]; 0 where that is 0 or less."""
+        """Return the share of each pixel's opacity [H, W] in front of a depth [H, W]; 0 for depths up to 0."""
         rays = camera.rays(device=self.device).view(-1, 3)
         far = depth.to(rays).flatten() / rays[:, 2] / self.field.region.unit
         shares = []
@@ -101,7 +92,7 @@ class FieldModel:
 
     @torch.no_grad()
     def lattice(self, axes: tuple[Tensor, Tensor, Tensor]) -> Tensor:
-        """Signed distances [X, Y, Z] in world units at all combinations of world coordinates, on the CPU."""
+        """Return signed distances [X, Y, Z] in world units at all combinations of world coordinates, on the CPU."""
         region = self.field.region
         own = [
             ((axis.to(self.device, torch.float32)) - origin) / region.unit
@@ -110,50 +101,53 @@ class FieldModel:
         return (self.field.lattice(own) * region.unit).cpu()
 
     def _rays(self, camera: Camera) -> list[tuple[Tensor, Tensor]]:
-        """Origins and directions of all pixels, in parts."""
+        """Return batches of origins and directions of all pixels."""
         directions = camera.world_rays(device=self.device).view(-1, 3)
         center = self.field.region.inner(camera.pose(directions.dtype, self.device).center)
         return [(center.expand(len(part), 3), part) for part in directions.split(CHUNK)]
 
-    def _ray_pixels(self, origin: Tensor, direction: Tensor, depth: bool) -> _RayPixels:
+    def _render_rays(self, origin: Tensor, direction: Tensor, depth: bool) -> tuple[Tensor, ...]:
+        """Return display color [N, 3], normal [N, 3], opacity [N] and distance [N] of rays."""
         marched = march(self.field, origin, direction, self.recipe.sampling)
         distance = marched.distance
         if depth:
             traced, hit = trace(self.field, origin, direction)
             distance = torch.where(hit, traced, distance)
-        return _RayPixels(marched.color, marched.normal, marched.opacity, distance)
+        return marched.color, marched.normal, marched.opacity, distance
 
 
 def implicit_surface(cameras: Mapping[str, Camera], model: FieldModel, *, resolution: int) -> Surface:
-    """The zero set of a model's distance, where at least two cameras may see it: nearer than their own distance.
+    """Extract the zero set of a model's distance, if at least two cameras can see it.
+
+    The surface lies within the distance of the cameras from their center of interest.
 
     Args:
-        cameras: at least two. model: model of the run. resolution: voxels along the longest side.
+        cameras: at least two cameras.
+        model: model of the run.
+        resolution: voxels along the longest side.
 
     Raises:
         PolarguideError: there is no surface, or a library is missing.
     """
     optional_import("skimage.measure", "a mesh")
-    around = scene_frame(list(cameras.values()))
-    reach = around.distance
+    frame = scene_frame(list(cameras.values()))
+    reach = frame.distance
     coarse = 2 * reach / COARSE
-    whole = Box(around.center - reach, coarse, (COARSE, COARSE, COARSE))
-    places, distance = _sampled(whole, model)
+    places, distance = _sampled(Box(frame.center - reach, coarse, (COARSE, COARSE, COARSE)), model)
     near = places[(distance.abs() < coarse) & (_in_pictures(cameras, places) >= 2)]
-    box = box_around([near], around.center, reach, resolution)
+    box = box_around([near], frame.center, reach, resolution)
     places, distance = _sampled(box, model)
-    counts = _in_pictures(cameras, places)
-    return zero_surface(box, distance, counts)
+    return zero_surface(box, distance, _in_pictures(cameras, places))
 
 
 def _sampled(box: Box, model: FieldModel) -> tuple[Tensor, Tensor]:
-    """Places [X, Y, Z, 3] of a box's voxels, and the distances [X, Y, Z] there."""
+    """Return the centers [X, Y, Z, 3] of a box's voxels, and the distances [X, Y, Z] there."""
     x, y, z = (box.low[k] + box.size * (torch.arange(n) + 0.5) for k, n in enumerate(box.counts))
     return torch.stack(torch.meshgrid(x, y, z, indexing="ij"), dim=-1), model.lattice((x, y, z))
 
 
 def _in_pictures(cameras: Mapping[str, Camera], places: Tensor) -> Tensor:
-    """How many cameras have places [..., 3] in their pictures, hidden ones included: [...]."""
+    """Return the number of cameras [...] whose pictures contain places [..., 3], including hidden ones."""
     counts = torch.zeros(places.shape[:-1])
     for camera in cameras.values():
         for part, count in zip(places, counts, strict=True):

@@ -14,16 +14,17 @@ Representation = Literal["grids", "networks"]
 
 @dataclass(frozen=True)
 class FieldShape:
-    """Of what a field is made.
+    """Sizes of a field.
 
     Attributes:
         kind: dense grids with a small head, or the networks of the publication.
-        resolutions: resolutions of the grids, cells along a side. channels: features that each of them has.
+        resolutions: resolutions of the grids in cells along a side.
+        channels: features of each grid.
         width: width of the two hidden layers of the heads.
         background: resolutions of the grids behind the cameras' sphere.
-        first_radius: of the sphere that the surface starts as, in the unit of the region: half of what a picture shows
-            across. It is never more than half of the radius of the cameras' sphere.
-        first_spread: reciprocal of the sharpness that the surface starts with, over the field's unit.
+        first_radius: radius of the initial spherical surface in the unit of the region, which is half the width of a
+            picture at the center. It is clamped to half of the radius of the cameras' sphere.
+        first_spread: reciprocal of the initial sharpness, in the unit of the region.
     """
 
     kind: Representation = "grids"
@@ -37,12 +38,14 @@ class FieldShape:
 
 @dataclass(frozen=True)
 class Sampling:
-    """The rays and samples of a step.
+    """Rays and samples of a step.
 
     Attributes:
-        rays: of one view. coarse: samples of a ray, without a gradient, that find the surface; as many again find it
-            more precisely. fine: samples with a gradient. background: samples behind the cameras' sphere.
-        neighbors: heaviest samples of a ray at whose neighbors the guidance looks.
+        rays: rays of one view.
+        coarse: samples of a ray in the search for the surface, without a gradient. A second search takes as many.
+        fine: samples of a ray with a gradient.
+        background: samples of a ray behind the cameras' sphere.
+        neighbors: samples of a ray with the largest weights, whose neighbors the guidance evaluates.
     """
 
     rays: int = 512
@@ -53,7 +56,7 @@ class Sampling:
 
     @property
     def samples(self) -> int:
-        """Places that a step asks the field about, with a gradient."""
+        """Number of samples of a step with a gradient."""
         return self.rays * (self.fine + self.background + 6 * self.neighbors)
 
 
@@ -62,13 +65,13 @@ class FieldWeights:
     """Weights of the loss terms.
 
     Attributes:
-        color: L1 of shown colors, times 1 - DoLP.
+        color: L1 of display colors, times 1 - DoLP.
         aolp: difference of the angles in radians, times DoLP.
-        eikonal: squared difference of the slope's length from 1.
-        guidance: L1 of the covariances of normals, from ``guided`` on.
-        guided: share of all steps after which the guidance begins.
-        circular: angles are compared as 1 - cos of twice their difference over 2, and the guidance doubles them:
-            both are the same at 0 and 180 degrees, which the published terms are not.
+        eikonal: squared difference of the gradient's length from 1.
+        guidance: L1 of the covariances of normals, after ``guided``.
+        guided: share of all steps before the guidance.
+        circular: compare angles as (1 - cos of twice their difference) / 2, and double the angles in the guidance. Both
+            terms are then equal at 0 and 180 degrees, unlike the published terms.
     """
 
     color: float = 1.0
@@ -81,14 +84,17 @@ class FieldWeights:
 
 @dataclass(frozen=True)
 class FieldRates:
-    """Learning rates (Adam), which rise over the first steps and fall along a cosine.
+    """Learning rates of Adam. They rise over the first steps and fall along a cosine.
 
     Attributes:
-        distances: of the coarsest grid of distances. finer: those of the others go with this power of their cells'
-            size: with 1, all of them bend normals as fast.
-        features: features of all grids of features. networks: of heads and networks. sharpness: sharpness of its
-            logarithm, over 10.
-        warmup: share of all steps over which they rise. last: what they end with, over what they rise to.
+        distances: rate of the coarsest grid of distances.
+        finer: exponent of the rates of finer grids over the size of their cells. With 1, all grids bend normals at the
+            same rate.
+        features: rate of the grids of features.
+        networks: rate of heads and networks.
+        sharpness: rate of the logarithm of the sharpness, over 10.
+        warmup: share of all steps of the rise.
+        last: ratio of the last rate to the highest.
     """
 
     distances: float = 3e-2
@@ -102,10 +108,16 @@ class FieldRates:
 
 @dataclass(frozen=True)
 class NeuralRecipe:
-    """A method that learns a field.
+    """A method that trains a field.
 
     Attributes:
-        name: as given to ``--recipe``. about: one line. steps: the default number.
+        name: value of ``--recipe``.
+        about: description in one line.
+        steps: default number of steps.
+        shape: sizes of the field.
+        sampling: rays and samples of a step.
+        weights: weights of the loss terms.
+        rates: learning rates.
     """
 
     name: str
@@ -118,18 +130,17 @@ class NeuralRecipe:
 
     @property
     def numbers(self) -> int:
-        """About how many numbers are learned."""
+        """Approximate number of parameters."""
         shape = self.shape
         if shape.kind == "networks":
             return 1_000_000
-        behind = sum((n + 1) ** 3 for n in shape.background)
-        return sum((1 + shape.channels) * (n + 2) ** 3 for n in shape.resolutions) + shape.channels * behind
+        background = shape.channels * sum((n + 1) ** 3 for n in shape.background)
+        return sum((1 + shape.channels) * (n + 2) ** 3 for n in shape.resolutions) + background
 
     def data(self) -> dict[str, Any]:
-        """All values as plain JSON types, for a run's folder."""
-        plain: dict[str, Any] = json.loads(json.dumps(asdict(self)))
-        return plain
+        """Return all values as plain JSON types, for a run folder."""
+        return dict(json.loads(json.dumps(asdict(self))))
 
     def differs(self, data: Mapping[str, Any]) -> bool:
-        """True where a value differs from the one that a run's folder records."""
+        """Return True if a value differs from the recorded values of a run folder."""
         return values_differ(self.data(), data)

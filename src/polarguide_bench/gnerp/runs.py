@@ -1,6 +1,6 @@
 """Runs of a field: training, resuming and opening. They have no viewer, no export and no page.
 
-The memory of a field's training, planned from the headers of the scene's files.
+The memory of a training is planned from the headers of the scene's files.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import Any
 import torch
 
 from polarguide.capture import Scene
-from polarguide.core.errors import PolarguideError
+from polarguide.core.errors import require
 from polarguide.core.options import DeviceName, PathLike, SceneOptions, SessionOptions, index_of
 from polarguide.core.progress import SILENT, Reporter
 from polarguide.core.system import return_freed_memory
@@ -42,39 +42,43 @@ from polarguide_bench.gnerp.recipe import NeuralRecipe
 from polarguide_bench.gnerp.state import FieldState
 
 FIELD_COPIES = 5
-"""Copies of the parameters of a field: values, gradients, two moments, and those in the file that is written."""
+"""Copies of the parameters of a field: values, gradients, two moments, and the checkpoint."""
 SAMPLE = 14_000
-"""Bytes of a sample of a step."""
+"""Memory of a sample of a step, in bytes."""
 READ_VIEW = 60
-"""Bytes of a pixel of the view of a step."""
-TARGET_KEPT = 10
-"""Bytes of a pixel of what is kept of each view."""
+"""Memory of a pixel of the view of a step, in bytes."""
+TARGET_BYTES = 10
+"""Memory of a pixel in the cache of targets, in bytes."""
 
 
 def plan_field_memory(
     pixels: Sequence[int], recipe: NeuralRecipe, *, limit: float | None, in_memory: bool = False
 ) -> MemoryPlan:
-    """Share out memory between the step of a field's training and its views.
+    """Divide memory between the step of a field's training and its views.
 
     Args:
-        pixels: pixels of each view as it is trained on. recipe: the method.
-        limit: GiB that the process may take; None: four fifths of what is free.
-        in_memory: whether the pictures are in memory already.
+        pixels: number of training pixels of each view.
+        recipe: the recipe.
+        limit: memory limit of the process in GiB; None: four fifths of the free memory.
+        in_memory: True if the pictures are already in memory.
 
     Raises:
-        PolarguideError: a limit that was given is too small.
+        PolarguideError: the limit is too small.
     """
     largest = max(pixels, default=0)
     own = PROCESS + 4 * recipe.numbers * FIELD_COPIES + SAMPLE * recipe.sampling.samples + READ_VIEW * largest
-    return share_memory(pixels, own, TARGET_KEPT, limit, in_memory, "", "")
+    return share_memory(pixels, own, TARGET_BYTES, limit, in_memory, "", "")
 
 
 @dataclass(frozen=True, eq=False)
 class FieldRun:
-    """A trained run of a field, as far as a comparison scores and shows it.
+    """A trained run of a field, with the interface that scores and reports need.
 
     Attributes:
-        folder: the run folder. configuration: its record. recipe: the method. model: the trained field.
+        folder: run folder.
+        configuration: its record.
+        recipe: recipe of the training.
+        model: the trained field.
     """
 
     folder: Path
@@ -89,7 +93,7 @@ class FieldRun:
 
     @cached_property
     def scene(self) -> Scene:
-        """The scene of the training, read on first use.
+        """Scene of the training, read on first use.
 
         Raises:
             PolarguideError: the scene cannot be read.
@@ -105,7 +109,7 @@ class FieldRun:
         return {view.name: view.camera for view in self.scene.views}
 
     def surface(self) -> Surface:
-        """The zero set of the signed distance, for mesh scores.
+        """Extract the zero set of the signed distance, for mesh scores.
 
         Raises:
             PolarguideError: there is no surface.
@@ -125,18 +129,22 @@ def train_field(
     reporter: Reporter = SILENT,
     should_stop: Ends = lambda: False,
 ) -> FieldRun:
-    """Train a field on a scene, into a run folder.
+    """Train a field on a scene, and write a run folder.
 
     Args:
-        scene: the scene folder. out: folder to write. recipe: the method.
+        scene: scene folder.
+        out: run folder.
+        recipe: the recipe.
         settings: steps, seed and other settings of the training.
-        session: device, threads, and how often the state is saved. reading: how the scene is read.
-        resume: go on with the run in ``out``, to the same result.
-        reporter: receives progress. should_stop: asked between steps.
+        session: device, threads and interval of checkpoints.
+        reading: options for reading the scene.
+        resume: resume the run in ``out``. The result does not depend on the interruption.
+        reporter: receives progress.
+        should_stop: called between steps.
 
     Raises:
-        PolarguideError: wrong input, a folder that does not suit, or a loss that is not finite.
-        TrainingStopped: ``should_stop`` returned true; the state is saved.
+        PolarguideError: invalid input, an unsuitable folder, or a loss that is not finite.
+        TrainingStopped: ``should_stop`` returned True. The state is saved.
     """
     out = Path(out)
     use_threads(session.threads)
@@ -152,7 +160,7 @@ def train_field(
     configuration = RunConfiguration.of(loaded, recipe.name, recipe.data(), resolved, backend.device)
     if not all(view.is_determined for view in loaded.train_views):
         reporter.warn(ignored_filters(recipe.name))
-    return_freed_memory()  # of decoded files
+    return_freed_memory()
     with writing_to(out), closing(view_store(plan, backend, out, reporter)) as store:
         state = None
         if earlier is not None:
@@ -172,20 +180,20 @@ def open_field(folder: PathLike, recipe: NeuralRecipe, *, device: DeviceName = "
     """Open the run of a field.
 
     Raises:
-        PolarguideError: the folder is no run, is damaged, or belongs to another recipe.
+        PolarguideError: the folder is not a run, is damaged, or belongs to another recipe.
     """
     folder = Path(folder)
     configuration = RunConfiguration.load(folder)
     backend = choose_backend(device)
-    state = load_field(folder, recipe, backend.device)
-    return FieldRun(folder, configuration, recipe, FieldModel(state, recipe, backend.device))
+    model = FieldModel(load_field(folder, recipe, backend.device), recipe, backend.device)
+    return FieldRun(folder, configuration, recipe, model)
 
 
 def load_field(folder: Path, recipe: NeuralRecipe, device: torch.device | str = "cpu") -> FieldState:
-    """Read the state of a field's training.
+    """Read the state of a field's training from its checkpoint.
 
     Raises:
-        PolarguideError: there is no checkpoint, or it is damaged.
+        PolarguideError: the checkpoint is missing or damaged.
     """
     with checkpoint_tensors(folder) as tensors:
         return FieldState.from_tensors(tensors, recipe, device)
@@ -197,14 +205,16 @@ def resolve_field(
     recipe: NeuralRecipe,
     resumed: ResolvedSettings | None = None,
 ) -> ResolvedSettings:
-    """The settings of a field's training, with nothing left open.
+    """Resolve the open settings of a field's training.
 
     Args:
-        settings: as specified. scene, recipe: those of the training.
-        resumed: settings of the run that is resumed, which come before those of the scene.
+        settings: specified settings.
+        scene: the scene.
+        recipe: the recipe.
+        resumed: settings of the resumed run, if any. They override those of the scene.
 
     Raises:
-        PolarguideError: a setting that means nothing for a field.
+        PolarguideError: a setting that a field does not support.
     """
     recorded: dict[str, Any] = {} if resumed is None else vars(resumed)
     values: dict[str, Any] = {
@@ -219,11 +229,11 @@ def resolve_field(
     if values["background"] == "auto":
         values["background"] = "scene"
     for name, most in (("gaussians", 0), ("views_per_step", 1)):
-        if values[name] > most:
-            raise PolarguideError(
-                name,
-                expected=f"{most} with the recipe {recipe.name}, a field",
-                found=str(values[name]),
-                remedy="Leave it out.",
-            )
+        require(
+            values[name] <= most,
+            name,
+            expected=f"{most} with the recipe {recipe.name}, a field",
+            found=str(values[name]),
+            remedy="Leave it out.",
+        )
     return ResolvedSettings(**values)

@@ -1,1 +1,1 @@
-"""Calibrate a polarization sensor: analyzer vectors from shots of a polarizer before a uniform light."""
+"""Calibration of a polarization sensor: analyzer vectors from shots of a polarizer in front of a uniform light."""

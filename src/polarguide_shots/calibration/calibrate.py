@@ -1,7 +1,8 @@
-"""``calibrate_sensor``: shots of a polarizer -> a file of analyzer vectors, and a picture of what they are like."""
+"""Calibration of a sensor: analyzer vectors of pixels or blocks from shots of a polarizer."""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,25 +21,24 @@ from polarguide.capture.sensor.analyzers import (
     write_analyzers,
 )
 from polarguide.capture.sensor.pattern import Pattern, tiled
-from polarguide.core.errors import PolarguideError
+from polarguide.core.errors import require
 from polarguide.core.files import make_folder
 from polarguide.core.progress import SILENT, Reporter
 from polarguide.visualization.figures import write_png
 from polarguide_shots.calibration.report import Position, calibration_picture, lines, positions
 from polarguide_shots.calibration.settings import CalibrateSettings
-from polarguide_shots.calibration.shots import ShotMeans, Shots
-from polarguide_shots.calibration.solve import ShotFit, solve_shots
+from polarguide_shots.calibration.shots import ShotFit, ShotMeans, Shots, solve_shots
 
 BLOCK = 32
-"""Side of a block in pixels, where it is not given."""
+"""Default side of a block in pixels."""
 NEIGHBORHOOD = 31
-"""Cells of one color, each way, whose mean brightness is that of a uniform light at the middle one."""
+"""Side of the neighborhood that determines the brightness of the light, in cells of one color."""
 LEAST_THROUGHPUT = 0.5
-"""A polarizer with less throughput is a defect of the sensor."""
+"""Smallest throughput of a polarizer without a defect."""
 MOST_THROUGHPUT = 1.5
-"""A polarizer with more throughput is a defect of the sensor."""
+"""Largest throughput of a polarizer without a defect."""
 MOST_DIATTENUATION = 1.3
-"""A polarizer with more diattenuation is a defect of the sensor."""
+"""Largest diattenuation of a polarizer without a defect."""
 
 Array = NDArray[np.float32]
 
@@ -48,9 +48,9 @@ class AnalyzerFit:
     """Analyzer vectors of single pixels.
 
     Attributes:
-        vectors: [H, W, 3]; around each pixel, the mean of the first components of its color is 1/2.
-        noise: variance of a vector by the deviations of its shots: sum over components, mean over pixels.
-        defects: pixels without a plausible polarizer, [H, W].
+        vectors: [H, W, 3]; the local mean of the first components of a color is 1/2.
+        noise: variance of a vector by the deviations of its shots, summed over components, averaged over pixels.
+        defects: mask [H, W] of the pixels without a plausible polarizer.
     """
 
     vectors: Array
@@ -60,12 +60,12 @@ class AnalyzerFit:
 
 @dataclass(frozen=True)
 class BlockChoice:
-    """Whether pixels get vectors of their own.
+    """Size of the blocks that share a vector.
 
     Attributes:
-        block: side in pixels of what shares a vector; the pattern's period for single pixels.
-        noise: standard deviation of a single pixel's vector by noise, as a share of its throughput.
-        scatter: the same of what really differs between the pixels of a block.
+        block: side of a block in pixels; the period of the pattern for single pixels.
+        noise: standard deviation of a pixel's vector by noise, as a share of its throughput.
+        scatter: standard deviation of the vectors within a block without noise, as a share of their throughput.
     """
 
     block: int
@@ -81,23 +81,20 @@ def fit_pixels(
     """Fit the vector of each pixel.
 
     Args:
-        shots: linear intensities [H, W] of each shot, and whether they are saturated.
+        shots: linear intensities [H, W] of each shot, and a mask [H, W] of saturated samples.
         light: Stokes vectors of the shots, [T, 3].
         pattern: pattern of the region.
     """
-    moments: Any = None
+    moments: Any = 0.0
+    squares: Any = 0.0
+    saturated: Any = False
     for (values, clipped), stokes in zip(shots, light, strict=True):
-        if moments is None:
-            moments = np.zeros((3, *values.shape))
-            squares = np.zeros(values.shape)
-            saturated = np.zeros(values.shape, bool)
-        moments += stokes[:, None, None] * values
-        squares += np.square(values, dtype=np.float64)
-        saturated |= clipped
+        moments = moments + stokes[:, None, None] * values
+        squares = squares + np.square(values, dtype=np.float64)
+        saturated = saturated | clipped
     normal = np.linalg.inv(light.T @ light)
     vectors = np.einsum("ij,jhw->ihw", normal, moments)
-    rest = np.maximum(squares - np.einsum("ihw,ihw->hw", vectors, moments), 0.0)
-    variance = rest / max(1, len(light) - 3)
+    variance = np.maximum(squares - np.einsum("ihw,ihw->hw", vectors, moments), 0.0) / max(1, len(light) - 3)
     level = _brightness(2 * vectors[0], pattern)
     vectors /= level
     defects = saturated | ~plausible(
@@ -109,7 +106,7 @@ def fit_pixels(
 
 
 def plausible(vectors: Any, nominal: Any) -> NDArray[np.bool_]:
-    """Whether vectors [..., 3] are those of polarizers near their nominal angles (radians, broadcastable to [...])."""
+    """Return a mask of vectors [..., 3] that are plausible for polarizers near their nominal angles in radians."""
     gain = 2 * vectors[..., 0]
     strength = 2 * np.hypot(vectors[..., 1], vectors[..., 2])
     cosine = vectors[..., 1] * np.cos(2 * nominal) + vectors[..., 2] * np.sin(2 * nominal)
@@ -125,11 +122,18 @@ def plausible(vectors: Any, nominal: Any) -> NDArray[np.bool_]:
 def choose_block(
     pixels: AnalyzerFit, offset: tuple[int, int], pattern: Pattern, specified: int | None
 ) -> BlockChoice:
-    """Choose what shares a vector: single pixels where their noise is less than what their mean over a block hides."""
+    """Choose the size of blocks: single pixels if their noise is less than the scatter within blocks.
+
+    Args:
+        pixels: vectors of single pixels.
+        offset: column and row of the first sample in the sensor.
+        pattern: pattern of the region.
+        specified: side of a block according to the user, or None.
+    """
     around = _neighborhoods(pixels, offset, pattern)
     deviation = (pixels.vectors - around).astype(np.float64)
     deviation[pixels.defects] = 0.0
-    # What is common to the pixels of a cell changes its brightness, not its polarization.
+    # A common deviation of the pixels of a cell changes its brightness, not its polarization.
     left, top = pattern.cell_corner()
     height, width = (
         (length - cut) // 2 for length, cut in zip(pixels.defects.shape, (top, left), strict=True)
@@ -145,28 +149,31 @@ def choose_block(
 
 
 def shared(pixels: AnalyzerFit, offset: tuple[int, int], block: int, pattern: Pattern) -> Array:
-    """The vectors that go into the file: means over blocks, in which defects have no part.
+    """Return the vectors of the file, means over blocks without defects.
 
-    Where each pixel has its own, a defect gets the mean of its neighborhood.
+    With single pixels, a defect gets the mean of its neighborhood.
 
     Args:
-        pixels: the single vectors. offset: column and row of the sensor at which they start. block: side in pixels.
+        pixels: vectors of single pixels.
+        offset: column and row of the first sample in the sensor.
+        block: side of a block in pixels.
         pattern: pattern of the region.
 
     Returns:
         [rows, columns, P, P, 3] as in ``AnalyzerCalibration.vectors``.
     """
-    if block > pattern.period:
-        return block_means(pixels, offset, block, pattern)
-    around = _neighborhoods(pixels, offset, pattern)
-    vectors = np.where(pixels.defects[..., None], around, pixels.vectors)
-    return block_means(
-        replace(pixels, vectors=vectors, defects=np.zeros_like(pixels.defects)), offset, block, pattern
-    )
+    if block <= pattern.period:
+        around = _neighborhoods(pixels, offset, pattern)
+        vectors = np.where(pixels.defects[..., None], around, pixels.vectors)
+        pixels = replace(pixels, vectors=vectors, defects=np.zeros_like(pixels.defects))
+    return block_means(pixels, offset, block, pattern)
 
 
 def block_means(pixels: AnalyzerFit, offset: tuple[int, int], block: int, pattern: Pattern) -> Array:
-    """Mean vectors of blocks by place in the pattern; the mean over the sensor where no pixel is sound."""
+    """Return the mean vectors of blocks by position in the pattern; the mean over the sensor for a block of defects.
+
+    Args and result are those of ``shared``.
+    """
     height, width, _ = pixels.vectors.shape
     period = pattern.period
     rows, columns = grid_shape(offset, (width, height), block)
@@ -186,7 +193,7 @@ def block_means(pixels: AnalyzerFit, offset: tuple[int, int], block: int, patter
 
 
 def _neighborhoods(pixels: AnalyzerFit, offset: tuple[int, int], pattern: Pattern) -> Array:
-    """The mean vector of the block around each pixel, [H, W, 3]."""
+    """Return the mean vector of the block around each pixel, [H, W, 3]."""
     means = block_means(pixels, offset, BLOCK, pattern)
     y = np.arange(pixels.vectors.shape[0]) + offset[1]
     x = np.arange(pixels.vectors.shape[1]) + offset[0]
@@ -197,12 +204,13 @@ def _neighborhoods(pixels: AnalyzerFit, offset: tuple[int, int], pattern: Patter
 
 
 def _brightness(throughput: NDArray[np.float64], pattern: Pattern) -> NDArray[np.float64]:
-    """Relative illumination of each pixel, [H, W]: a smooth surface fitted to the brightness of its color.
+    """Fit a smooth surface to the brightness of each color, [H, W].
 
-    It is smooth, and a plane over a cell, so that a light that is not quite uniform does not look like polarization.
+    The surface is a plane over a cell. An illumination that is not uniform therefore does not look like polarization.
 
     Args:
-        throughput: [H, W]. pattern: pattern of the region.
+        throughput: [H, W].
+        pattern: pattern of the region.
     """
     left, top = pattern.cell_corner()
     height, width = ((length - cut) // 2 for length, cut in zip(throughput.shape, (top, left), strict=True))
@@ -214,7 +222,7 @@ def _brightness(throughput: NDArray[np.float64], pattern: Pattern) -> NDArray[np
     for row, column in np.ndindex(2, 2):
         plane = _smooth(cells[row::2, column::2], NEIGHBORHOOD // 2)
         surface = _at_places(plane, (left + 2 * column, top + 2 * row), 4, out.shape)
-        # Pixels beyond the first and last whole cell belong to a cell of this color, too: places repeat every 4.
+        # The period of 4 pixels includes incomplete cells at the edges.
         own = np.ix_(
             (np.arange(out.shape[0]) - top) // 2 % 2 == row,
             (np.arange(out.shape[1]) - left) // 2 % 2 == column,
@@ -226,15 +234,23 @@ def _brightness(throughput: NDArray[np.float64], pattern: Pattern) -> NDArray[np
 def _at_places(
     cells: NDArray[np.float64], corner: tuple[int, int], step: int, shape: tuple[int, ...]
 ) -> NDArray[np.float64]:
-    """A surface of cells, 2x2 pixels that lie ``step`` apart from a corner on, interpolated at all pixels."""
+    """Interpolate values of cells of 2x2 pixels at all pixels.
+
+    Args:
+        cells: values of the cells.
+        corner: column and row of the first cell.
+        step: distance of cells in pixels.
+        shape: rows and columns of the result.
+    """
     x = ((np.arange(shape[1]) - corner[0] - 0.5) / step).astype(np.float32)
     y = ((np.arange(shape[0]) - corner[1] - 0.5) / step).astype(np.float32)
-    surface = cv2.remap(cells, *np.meshgrid(x, y), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(surface, np.float64)
+    return np.asarray(
+        cv2.remap(cells, *np.meshgrid(x, y), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.float64
+    )
 
 
 def _smooth(values: NDArray[np.float64], side: int) -> NDArray[np.float64]:
-    """The plane of least squares through the square around each value, at its middle; smaller squares at the edges."""
+    """Fit a plane to the square around each value, and return its value in the middle. Squares are smaller at edges."""
     y, x = np.mgrid[: values.shape[0], : values.shape[1]].astype(np.float64)
 
     def box(plane: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -244,31 +260,34 @@ def _smooth(values: NDArray[np.float64], side: int) -> NDArray[np.float64]:
         )
 
     count = box(np.ones_like(values))
-    right = box(x) / count - x
-    below = box(y) / count - y
     mean = box(values) / count
-    # Squares are products of intervals: x and y are not correlated in them.
-    spread_x = box(x * x) / count - (box(x) / count) ** 2
-    spread_y = box(y * y) / count - (box(y) / count) ** 2
-    slope_x = (box(values * x) / count - mean * (box(x) / count)) / np.maximum(spread_x, 1e-9)
-    slope_y = (box(values * y) / count - mean * (box(y) / count)) / np.maximum(spread_y, 1e-9)
-    return np.asarray(mean - slope_x * right - slope_y * below)
+    # x and y are not correlated in a square: each contributes its own slope.
+    result = mean
+    for axis in (x, y):
+        center = box(axis) / count
+        spread = box(axis * axis) / count - center**2
+        slope = (box(values * axis) / count - mean * center) / np.maximum(spread, 1e-9)
+        result = result - slope * (center - axis)
+    return result
 
 
 MOST_DEFECTS = 0.05
-"""Share of pixels without a plausible polarizer from which on the fault is not the sensor's."""
+"""Largest share of pixels without a plausible polarizer for valid settings and shots."""
 DOUBTFUL = 0.005
-"""Misfit, and DoLP of a flat field, above which a warning is due: DoLP will be wrong by about as much."""
+"""Misfit, or DoLP of a flat field, above which a warning is given. The DoLP has errors of this size."""
 
 
 @dataclass(frozen=True, eq=False)
 class Calibrated:
-    """The outcome of a calibration.
+    """Result of a calibration.
 
     Attributes:
-        path: the file. picture: the PNG beside it.
-        calibration: what the file holds. positions: what it is like.
-        shots: angles and levels of the shots. choice: what shares a vector, and why.
+        path: path of the calibration.
+        picture: path of the PNG next to it.
+        calibration: content of the file.
+        positions: figures of the positions.
+        shots: angles and levels of the shots.
+        choice: size of the blocks.
         defects: number of pixels without a plausible polarizer, which got the vector of their block.
     """
 
@@ -286,22 +305,22 @@ def calibrate_sensor(
 ) -> Calibrated:
     """Estimate the analyzer vectors of a sensor (superpixel calibration, Powell and Gruev 2013).
 
-    Angles and levels of the shots are found first, from means over the sensor; then every pixel's vector by linear
-    least squares from its own intensities. A common factor of all pixels around one (the light, the lens's fall-off) is
-    not part of the vectors.
+    Means over the sensor determine angles and levels of the shots. Linear least squares of its own intensities then
+    determine the vector of each pixel. A common factor of neighboring pixels (light, vignetting) is not part of the
+    vectors.
 
     Args:
-        source: folder of mosaics of a linear polarizer before a uniform light, at five or more angles.
-        out: file to write, ``.safetensors``; a picture of the same name goes beside it.
-        settings: how the shots were taken. reporter: told how far it is, and the findings.
+        source: folder of mosaics of a linear polarizer in front of a uniform light, at five or more angles.
+        out: file to write, ``.safetensors``; a picture of the same name is written next to it.
+        settings: settings of the shots and the calibration.
+        reporter: receiver of progress and messages.
 
     Raises:
-        PolarguideError: a file or setting cannot be used, the shots contradict each other, or ``out`` exists.
+        PolarguideError: a file or setting is invalid, the shots contradict each other, or ``out`` exists.
     """
     settings = settings.checked()
-    _require_new(out)
+    _require_new(out, Path(source), settings)
     files = Shots(Path(source), settings)
-    _require_apart(out, Path(source), settings)
     known = settings.known_angles(files.files)
     reference = settings.reference or ("mean" if known is None else "angles")
     ratio = settings.polarizer_extinction
@@ -317,16 +336,15 @@ def calibrate_sensor(
         files=files.files,
     )
     _say_shots(fit, settings, measured, reporter)
-    light = fit.stokes(diattenuation)
-    pixels = fit_pixels(files.linear(measured.levels, reporter), light, files.pattern)
+    pixels = fit_pixels(files.linear(measured.levels, reporter), fit.stokes(diattenuation), files.pattern)
     defects = int(pixels.defects.sum())
-    if defects > MOST_DEFECTS * pixels.defects.size:
-        raise PolarguideError(
-            source,
-            expected="polarizers near the angles of the sensor's pattern at nearly all pixels",
-            found=f"other angles at {defects / pixels.defects.size:.0%} of the pixels",
-            remedy="Check --sensor, --offset-x and --offset-y, and that the polarizer covers the whole field.",
-        )
+    require(
+        defects <= MOST_DEFECTS * pixels.defects.size,
+        source,
+        expected="polarizers near the angles of the sensor's pattern at nearly all pixels",
+        found=f"other angles at {defects / pixels.defects.size:.0%} of the pixels",
+        remedy="Check --sensor, --offset-x and --offset-y, and that the polarizer covers the whole field.",
+    )
     choice = choose_block(pixels, settings.offset, files.pattern, settings.block)
     vectors = shared(pixels, settings.offset, choice.block, files.pattern)
     calibration = AnalyzerCalibration(
@@ -343,84 +361,90 @@ def calibrate_sensor(
     return Calibrated(out, picture, calibration, analyzers, fit, choice, defects)
 
 
-def _require_apart(out: Path, shots: Path, settings: CalibrateSettings) -> None:
-    """Refuse to write the picture among those that are read: the next call would take it for a shot."""
-    for folder in (shots, settings.flat, settings.dark_frame):
-        if folder is not None and folder.is_dir() and folder.resolve() == out.parent.resolve():
-            raise PolarguideError(
-                out,
-                expected=f"a place outside of {folder}",
-                found="the folder of the shots, where the picture would count as a shot",
-                remedy="Give another --out; nothing was written.",
-            )
+def _require_new(out: Path, shots: Path, settings: CalibrateSettings) -> None:
+    """Check that the files of the output are new, and not in a folder of shots, where the next call would read them.
 
-
-def _require_new(out: Path) -> None:
-    if out.suffix.lower() != SUFFIX:
-        raise PolarguideError(
-            "--out",
-            expected=f"a file name that ends in {SUFFIX}",
-            found=out.name,
-            remedy=f"End the name in {SUFFIX}.",
-        )
+    Raises:
+        PolarguideError: the suffix is wrong, a file exists, or ``out`` is in a folder of shots.
+    """
+    require(
+        out.suffix.lower() == SUFFIX,
+        "--out",
+        expected=f"a file name that ends in {SUFFIX}",
+        found=out.name,
+        remedy=f"End the name in {SUFFIX}.",
+    )
     for path in (out, out.with_suffix(".png")):
-        if path.exists() or path.is_symlink():
-            raise PolarguideError(
-                path,
-                expected="a new file",
-                found="an existing file",
-                remedy="Give another --out, or remove it; nothing was written.",
-            )
+        require(
+            not os.path.lexists(path),
+            path,
+            expected="a new file",
+            found="an existing file",
+            remedy="Give another --out, or remove it; nothing was written.",
+        )
+    for folder in (shots, settings.flat, settings.dark_frame):
+        require(
+            folder is None or not folder.is_dir() or folder.resolve() != out.parent.resolve(),
+            out,
+            expected=f"a place outside of {folder}",
+            found="the folder of the shots, where the picture would count as a shot",
+            remedy="Give another --out; nothing was written.",
+        )
 
 
 def _say_shots(fit: ShotFit, settings: CalibrateSettings, measured: ShotMeans, reporter: Reporter) -> None:
-    """Report of the estimates from the shots, and of quantities that the shots do not determine."""
+    """Report the estimates from the shots, and the assumptions on quantities that the shots do not determine."""
     angles = ", ".join(f"{angle:.1f}" for angle in np.degrees(fit.angles))
     reporter.say(
         f"{len(fit.angles)} shots, polarizer at {angles} degrees; misfit {fit.misfit:.2%} of their mean."
     )
     if settings.angles is not None:
-        drift = f"{fit.levels.max() / fit.levels.min() - 1:.1%}"
-        reporter.say(f"The light behind the polarizer varied by {drift}; corrected.")
+        drift = fit.levels.max() / fit.levels.min() - 1
+        reporter.say(f"The light behind the polarizer varied by {drift:.1%}; corrected.")
         if settings.reference == "mean":
             zero = np.degrees(-fit.zero)
-            reporter.say(f"The zero of the angles given lay {zero:+.2f} degrees off the sensor's mean.")
+            reporter.say(
+                f"The zero of the given angles differs by {zero:+.2f} degrees from the sensor's mean."
+            )
     else:
         reporter.say(
-            "Angles were estimated. The shots do not tell their zero: the positions' mean deviation from their names "
-            "is taken as zero."
+            "The angles were estimated. The zero of the angles is the mean of the positions, because the shots do not "
+            "determine it."
         )
         if measured.flat is None:
             reporter.say(
-                "Without --angles and --flat, the light is taken as steady and unpolarized: what it is not would look "
+                "Without --angles and --flat, the light is assumed to be steady and unpolarized. Deviations would look "
                 "like an error of the sensor."
             )
     if settings.polarizer_extinction is None:
         reporter.say(
-            "The polarizer is taken as ideal: extinction ratios are those of polarizer and sensor together "
-            "(--polarizer-extinction)."
+            "The polarizer is assumed to be ideal: extinction ratios include the polarizer (--polarizer-extinction)."
         )
     if fit.misfit > DOUBTFUL:
-        reporter.warn(f"The shots disagree by {fit.misfit:.2%}: the calibration can be no better.")
+        reporter.warn(
+            f"The shots disagree by {fit.misfit:.2%}, which limits the accuracy of the calibration."
+        )
     if fit.flat_dolp is not None and settings.angles is not None:
-        reporter.say(f"The flat field, which had no part in this, has a DoLP of {fit.flat_dolp:.3f} with it.")
+        reporter.say(
+            f"The flat field, which was not used, has a DoLP of {fit.flat_dolp:.3f} with the calibration."
+        )
         if fit.flat_dolp > DOUBTFUL:
-            reporter.warn("The flat field, or the light behind the polarizer, is not unpolarized.")
+            reporter.warn("The flat field or the light behind the polarizer is polarized.")
 
 
 def _say_choice(
     choice: BlockChoice, settings: CalibrateSettings, files: Shots, defects: int, reporter: Reporter
 ) -> None:
-    own = choice.block == files.pattern.period
+    single = choice.block == files.pattern.period
     reporter.say(
         f"Pixels of a block differ by {choice.scatter:.2%}, the noise of one pixel's vector is {choice.noise:.2%}: "
-        f"{'each pixel has its own' if own else f'blocks of {choice.block} pixels share vectors'}"
-        f"{'' if settings.block is None else ' (as asked)'}."
+        f"{'each pixel has a vector' if single else f'blocks of {choice.block} pixels share vectors'}"
+        f"{'' if settings.block is None else ' (--block)'}."
     )
-    if own and choice.noise > choice.scatter:
+    if single and choice.noise > choice.scatter:
         reporter.warn(
-            "Pixels differ by less than their noise: a calibration of single pixels is less accurate than one of "
-            "blocks. Take more shots, or leave --block out."
+            "Pixels differ by less than their noise: a calibration of single pixels is less accurate than a "
+            "calibration of blocks. Take more shots, or leave --block out."
         )
     if defects:
         reporter.say(

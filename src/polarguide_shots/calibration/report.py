@@ -1,4 +1,4 @@
-"""Figures of a sensor's analyzers by position, the table for the console, and a picture."""
+"""Report of a calibration: figures of the positions, a table for the console, and a picture."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from polarguide.capture.sensor.analyzers import AnalyzerCalibration
 from polarguide.capture.sensor.pattern import Pattern
 from polarguide.geometry.polarizer import ANGLES, stokes_of_four
 from polarguide.visualization.figures import FONT, INK, Picture, contact_sheet, scalar_to_rgb, scale_bar
-from polarguide_shots.calibration.solve import ShotFit
+from polarguide_shots.calibration.shots import ShotFit
 
 COUNTLESS = 1000.0
-"""Extinction ratios above this are not told apart: noise and the polarizer decide them."""
+"""Largest extinction ratio that can be measured, limited by noise and the polarizer."""
 _COLORS = ("R", "G", "B")
 
 Array = NDArray[np.float64]
@@ -26,12 +26,15 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Position:
-    """The analyzers at one angle, behind one color.
+    """Analyzers of one angle and color.
 
     Attributes:
         name: "0", "45", ... or "R 0", ...
-        angle: nominal, degrees. color: 0 to 2, None for a monochrome sensor.
-        throughput: 1 is the mean around it; extinction: ratio; angle_error: degrees; all by block, [rows, columns].
+        angle: nominal angle, degrees.
+        color: 0 to 2, or None for a monochrome sensor.
+        throughput: throughput by block, [rows, columns]; the local mean is 1.
+        extinction: extinction ratio by block.
+        angle_error: error of the angle by block, degrees.
     """
 
     name: str
@@ -43,81 +46,73 @@ class Position:
 
 
 def positions(calibration: AnalyzerCalibration) -> list[Position]:
-    """The positions of a sensor, colors first, then by angle."""
+    """Return the positions of a sensor, by color, then by angle."""
     pattern = calibration.pattern
     colors = (None,) if pattern.colors is None else (0, 1, 2)
     rows = []
-    for color in colors:
-        for angle in ANGLES:
-            chosen = pattern.angles == angle
-            if color is not None and pattern.colors is not None:
-                chosen &= pattern.colors == color
-            vectors = calibration.vectors[:, :, chosen].astype(np.float64).mean(axis=2)
-            s0, s1, s2 = np.moveaxis(vectors, -1, 0)
-            strength = np.hypot(s1, s2)
-            extinction = (s0 + strength) / np.maximum(s0 - strength, (s0 + strength) / COUNTLESS)
-            turn = np.angle(np.exp(1j * (np.arctan2(s2, s1) - 2 * np.radians(angle)))) / 2
-            name = f"{angle}" if color is None else f"{_COLORS[color]} {angle}"
-            rows.append(Position(name, angle, color, 2 * s0, extinction, np.degrees(turn)))
+    for color, angle in itertools.product(colors, ANGLES):
+        mask = pattern.angles == angle
+        if color is not None and pattern.colors is not None:
+            mask &= pattern.colors == color
+        s0, s1, s2 = np.moveaxis(calibration.vectors[:, :, mask].astype(np.float64).mean(axis=2), -1, 0)
+        strength = np.hypot(s1, s2)
+        extinction = (s0 + strength) / np.maximum(s0 - strength, (s0 + strength) / COUNTLESS)
+        error = np.angle(np.exp(1j * (np.arctan2(s2, s1) - 2 * np.radians(angle)))) / 2
+        name = f"{angle}" if color is None else f"{_COLORS[color]} {angle}"
+        rows.append(Position(name, angle, color, 2 * s0, extinction, np.degrees(error)))
     return rows
 
 
-def spread(values: Array) -> tuple[float, float, float]:
-    """Median, 5th and 95th percentile."""
-    low, middle, high = np.percentile(values, [5, 50, 95])
-    return float(middle), float(low), float(high)
-
-
 def effect(calibration: AnalyzerCalibration) -> tuple[float, float]:
-    """Readings of the sensor without correction: the DoLP of unpolarized and of fully polarized light.
+    """Return the DoLP of unpolarized and of fully polarized light that the sensor measures without correction.
 
-    Both are medians over the blocks, the latter over angles of the light, too.
+    Both are medians over the blocks. The latter is also the median over angles of the light.
     """
     pattern = calibration.pattern
     vectors = calibration.vectors.astype(np.float64)
-    zero = []
-    full = []
-    turns = np.radians(np.arange(0, 180, 15))
-    light = np.stack([np.ones_like(turns), np.cos(2 * turns), np.sin(2 * turns)], axis=1)
+    zero: list[Array] = []
+    full: list[Array] = []
+    light = _polarized_light(np.radians(np.arange(0, 180, 15)))
     for top, left in itertools.product(range(0, pattern.period, 2), repeat=2):
         cell = vectors[:, :, top : top + 2, left : left + 2].reshape(*vectors.shape[:2], 4, 3)
         cell = cell[:, :, np.argsort(pattern.angles[top : top + 2, left : left + 2].ravel())]
-        zero.append(_dolp(np.moveaxis(cell[..., 0], -1, 0)))
-        full.append(_dolp(np.moveaxis(cell @ light.T, -2, 0)))
+        for readings, four in ((zero, cell[..., :1]), (full, cell @ light.T)):
+            s0, s1, s2 = stokes_of_four(np.moveaxis(four, -2, 0))
+            readings.append(np.hypot(s1, s2) / s0)
     return float(np.median(zero)), float(np.median(full))
 
 
-def _dolp(four: Array) -> Array:
-    s0, s1, s2 = stokes_of_four(four)
-    return np.asarray(np.hypot(s1, s2) / s0)
+def _polarized_light(angles: Array) -> Array:
+    """Return the Stokes vectors of fully polarized light at angles in radians, [N, 3]."""
+    return np.stack([np.ones_like(angles), np.cos(2 * angles), np.sin(2 * angles)], axis=1)
 
 
 def lines(calibration: AnalyzerCalibration, analyzers: list[Position]) -> list[str]:
-    """The table for the console."""
+    """Return the lines of the table for the console."""
     rows = ["position   throughput             extinction ratio       angle error in degrees"]
     for position in analyzers:
         cells = []
         for name, form in _FORMS.items():
             values = getattr(position, name)
-            middle, low, high = (form(value) for value in spread(values))
+            low, middle, high = map(form, np.percentile(values, [5, 50, 95]))
             cells.append(middle if values.size == 1 else f"{middle} ({low} to {high})")
         rows.append(f"{position.name + ' deg':<10} " + " ".join(f"{cell:<22}" for cell in cells).rstrip())
     unpolarized, polarized = effect(calibration)
-    rows.append("(median, and 5 % to 95 % of the blocks)")
-    rows.append(
-        f"Without it this sensor reads unpolarized light as DoLP {unpolarized:.3f}, fully polarized light as "
-        f"{polarized:.3f}."
-    )
-    return rows
+    return [
+        *rows,
+        "(median, and 5 % to 95 % of the blocks)",
+        f"Without it, this sensor measures unpolarized light as DoLP {unpolarized:.3f}, fully polarized light as "
+        f"{polarized:.3f}.",
+    ]
 
 
 def _ratio(value: float) -> str:
-    """An extinction ratio as text."""
+    """Format an extinction ratio."""
     return f">{COUNTLESS:.0f}" if value >= 0.999 * COUNTLESS else f"{value:.0f}"
 
 
 _FORMS = {"throughput": "{:.3f}".format, "extinction": _ratio, "angle_error": "{:+.2f}".format}
-"""Text of a number of each measure of a position."""
+"""Formats of the figures of a position."""
 
 
 _CURVES = {0: (204, 51, 51), 45: (46, 134, 46), 90: (51, 102, 204), 135: (190, 120, 20)}
@@ -140,42 +135,37 @@ def calibration_picture(
     """Draw a calibration.
 
     Args:
-        calibration: it. analyzers: its positions. fit: of the shots. means: of the shots by position, [T, K], and
-        pattern: pattern of the region, to which they belong.
+        calibration: the calibration.
+        analyzers: its positions.
+        fit: angles and levels of the shots.
+        means: means of the shots by position, [T, K].
+        pattern: pattern of the region of the shots.
     """
-    maps = _maps(analyzers)
-    curves = _curves(calibration, analyzers, fit, means, pattern)
-    width = max(maps.shape[1], curves.shape[1])
-    padded = [
-        np.pad(part, ((0, 0), (0, width - part.shape[1]), (0, 0)), constant_values=255)
-        for part in (curves, maps)
-    ]
-    return np.concatenate(padded)
+    parts = (_curves(calibration, analyzers, fit, means, pattern), _maps(analyzers))
+    width = max(part.shape[1] for part in parts)
+    return np.concatenate(
+        [np.pad(p, ((0, 0), (0, width - p.shape[1]), (0, 0)), constant_values=255) for p in parts]
+    )
 
 
 def _maps(analyzers: Sequence[Position]) -> Picture:
-    """Throughput, extinction ratio and angle error by block: a row an angle, three columns a color."""
-    colors = sorted(
-        {position.color for position in analyzers}, key=lambda color: -1 if color is None else color
-    )
+    """Draw throughput, extinction ratio and angle error by block: a row per angle, three columns per color."""
+    colors = list(dict.fromkeys(position.color for position in analyzers))
     kinds = (
-        ("throughput", "viridis", [p.throughput for p in analyzers]),
-        ("extinction ratio", "magma", [p.extinction for p in analyzers]),
-        ("angle error, degrees", "turbo", [p.angle_error for p in analyzers]),
+        ("throughput", "throughput", "viridis"),
+        ("extinction", "extinction ratio", "magma"),
+        ("angle_error", "angle error, degrees", "turbo"),
     )
     rows: list[list[Picture | None]] = [[] for _ in ANGLES]
     labels = []
     footer = []
-    for title, colormap, values in kinds:
-        low, high = _range(np.stack(values), signed=title.startswith("angle"))
-        for color in colors:
-            labels.append(title if color is None else f"{'RGB'[color]}: {title}")
-            footer.append(scale_bar(low, high, colormap))
-            for index, angle in enumerate(ANGLES):
-                channel = next(
-                    v for p, v in zip(analyzers, values, strict=True) if p.angle == angle and p.color == color
-                )
-                rows[index].append(scalar_to_rgb(torch.from_numpy(channel.copy()), low, high, colormap))
+    for (name, title, colormap), color in itertools.product(kinds, colors):
+        low, high = _range(np.stack([getattr(p, name) for p in analyzers]), signed=name == "angle_error")
+        labels.append(title if color is None else f"{_COLORS[color]}: {title}")
+        footer.append(scale_bar(low, high, colormap))
+        # Positions of a color are in the order of the angles.
+        for row, position in zip(rows, (p for p in analyzers if p.color == color), strict=True):
+            row.append(scalar_to_rgb(torch.from_numpy(getattr(position, name).copy()), low, high, colormap))
     return contact_sheet(
         rows,
         [f"{angle} deg" for angle in ANGLES],
@@ -187,7 +177,7 @@ def _maps(analyzers: Sequence[Position]) -> Picture:
 
 
 def _range(values: Array, *, signed: bool) -> tuple[float, float]:
-    """Ends of a scale, rounded outward to two digits."""
+    """Return the ends of a scale, rounded outward to two digits."""
     low, high = (float(end) for end in np.percentile(values, [1, 99]))
     if signed:
         end = max(0.1, float(np.ceil(10 * max(abs(low), abs(high))) / 10))
@@ -205,13 +195,13 @@ def _curves(
     means: Array,
     pattern: Pattern,
 ) -> Picture:
-    """Mean intensity of the positions of an angle against the angle of the polarizer, with Malus's law through it."""
+    """Draw the mean intensity of each angle of the pattern over the angle of the polarizer, with the fit."""
     drawn: Picture = np.full((_HEIGHT, _WIDTH, 3), 255, np.uint8)
     places = pattern.angles.ravel()
     bottom = _HEIGHT - _BOTTOM
     right = _WIDTH - _RIGHT - 330
-    turns = np.radians(np.linspace(0, 180, 181))
-    light = np.stack([np.ones_like(turns), np.cos(2 * turns), np.sin(2 * turns)], axis=1)
+    degrees = np.linspace(0, 180, 181)
+    light = _polarized_light(np.radians(degrees))
     curves = {a: light @ fit.vectors[places == a].mean(axis=0) for a in ANGLES}
     readings = {a: means[:, places == a].mean(axis=1) / fit.levels for a in ANGLES}
     top_value = max(float(curve.max()) for curve in curves.values()) * 1.05
@@ -236,24 +226,22 @@ def _curves(
         _HEIGHT - 10,
     )
     for angle in ANGLES:
-        points = np.array(
-            [at(float(np.degrees(t)), float(v)) for t, v in zip(turns, curves[angle], strict=True)]
-        )
-        cv2.polylines(drawn, [points.astype(np.int32)], False, _CURVES[angle], 1, cv2.LINE_AA)
-        for turn, value in zip(fit.angles, readings[angle], strict=True):
-            cv2.circle(drawn, at(float(np.degrees(turn)), float(value)), 4, _CURVES[angle], -1, cv2.LINE_AA)
+        points = np.array([at(*point) for point in zip(degrees, curves[angle], strict=True)], np.int32)
+        cv2.polylines(drawn, [points], False, _CURVES[angle], 1, cv2.LINE_AA)
+        for point in zip(np.degrees(fit.angles), readings[angle], strict=True):
+            cv2.circle(drawn, at(*point), 4, _CURVES[angle], -1, cv2.LINE_AA)
     lens = f", {calibration.lens}" if calibration.lens else ""
     block = calibration.block
-    own = "a vector a pixel" if block == calibration.pattern.period else f"blocks of {block} pixels"
-    title = f"{calibration.sensor}{lens}: {calibration.size[0]}x{calibration.size[1]} pixels, {own}"
-    _text(drawn, title, 12, 26, 0.6)
+    blocks = "single pixels" if block == calibration.pattern.period else f"blocks of {block} pixels"
+    size = f"{calibration.size[0]}x{calibration.size[1]} pixels"
+    _text(drawn, f"{calibration.sensor}{lens}: {size}, {blocks}", 12, 26, 0.6)
     _text(drawn, f"{len(means)} shots, misfit {fit.misfit:.2%} of their mean", 12, 50)
     _legend(drawn, analyzers, right + 24)
     return drawn
 
 
 def _legend(drawn: Picture, analyzers: Sequence[Position], x: int) -> None:
-    """Medians of the positions."""
+    """Draw the medians of the positions."""
     columns = (90, 168, 242)
     for text, place in zip(_FORMS, columns, strict=True):
         _text(drawn, text.replace("_", " "), x + place - 4, 50, 0.4)
@@ -262,9 +250,9 @@ def _legend(drawn: Picture, analyzers: Sequence[Position], x: int) -> None:
         cv2.circle(drawn, (x + 6, y - 4), 5, _CURVES[position.angle], -1, cv2.LINE_AA)
         _text(drawn, f"{position.name} deg", x + 18, y)
         for (name, form), place in zip(_FORMS.items(), columns, strict=True):
-            _text(drawn, form(spread(getattr(position, name))[0]), x + place, y)
+            _text(drawn, form(np.median(getattr(position, name))), x + place, y)
 
 
 def _text(drawn: Picture, text: str, x: int, y: int, scale: float = 0.45) -> None:
-    shown = text.encode("ascii", "replace").decode()
-    cv2.putText(drawn, shown, (x, y), FONT, scale, INK, 1, cv2.LINE_AA)
+    ascii_text = text.encode("ascii", "replace").decode()
+    cv2.putText(drawn, ascii_text, (x, y), FONT, scale, INK, 1, cv2.LINE_AA)

@@ -1,15 +1,32 @@
-"""The shots of a polarizer before a uniform light: read, checked, and averaged over the sensor."""
+"""Shots of a polarizer in front of a uniform light: validation, means over the sensor, angles and levels.
+
+The means of all positions of the pattern form a matrix ``M = X A^T``. X [T, 3] contains the Stokes vectors of the
+shots, ``L (1, e cos 2t, e sin 2t)``, and A [K, 3] the analyzer vectors of the positions. Both are estimated jointly by
+least squares. A is linear for given X and is eliminated (variable projection, Golub and Pereyra 1973).
+
+M does not determine:
+
+- the scale of A against L
+- for unknown angles, their common zero and their sense, which follow from the names of the positions
+- the diattenuation e of the polarizer, which scales S1 and S2
+- for unknown angles and levels, two more numbers. X may undergo a Lorentz boost, as by another polarizer in front or by
+  a polarized lamp.
+
+Levels are therefore free if the angles or an unpolarized flat field are given. Otherwise the light must be steady and
+unpolarized, and all levels are equal.
+"""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import least_squares
 
 from polarguide.capture.develop import sample_blocks
 from polarguide.capture.layout import describe_contents, index_files
@@ -23,21 +40,22 @@ from polarguide.capture.sensor.pattern import (
     sensor_pattern,
 )
 from polarguide.capture.sensor.raw_file import RAW_SUFFIXES, RawFormat, read_mosaic
-from polarguide.core.errors import PolarguideError
+from polarguide.core.errors import require
 from polarguide.core.files import require_folder
 from polarguide.core.progress import Reporter
+from polarguide.geometry.polarizer import malus
 from polarguide_shots.calibration.settings import CalibrateSettings
 
 FEWEST = 5
-"""Angles that are needed: as many points as determine an ellipse."""
+"""Smallest number of angles, the number of points that determine an ellipse."""
 SATURATED = 0.001
-"""Share of saturated samples above which a shot is refused; a few defects of the sensor stay below it."""
+"""Largest share of saturated samples of a shot, which allows for a few defects of the sensor."""
 TOO_DARK = 0.02
-"""Mean of a shot, as a share of full scale, below which it is refused."""
+"""Smallest mean of a shot, as a share of full scale."""
 UNEVEN = 0.2
-"""Largest share by which the dimmest part of uniform light is below its brightest part."""
+"""Smallest brightness of the dimmest part of a uniform light, as a share of the brightest part."""
 TEXTURED = 0.05
-"""Largest deviation of uniform light within 32 pixels."""
+"""Largest relative deviation of uniform light within 32 pixels."""
 _CELLS = 16
 _SMALLEST = 64
 
@@ -46,11 +64,13 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class ShotMeans:
-    """Shared properties of all shots, and their means.
+    """Levels and means of all shots.
 
     Attributes:
-        levels: of the stored values. means: of each shot over the sensor, by the pixel's place in the pattern of the
-            region, row by row, [T, P * P]; full scale is 1. flat: the same of the flat field, or None.
+        levels: levels of the stored values.
+        means: means of each shot over the sensor, [T, P * P], by position in the pattern of the region, row by row;
+            full scale is 1.
+        flat: means of the flat field, [P * P], or None.
     """
 
     levels: Levels
@@ -61,18 +81,24 @@ class ShotMeans:
 class Shots:
     """The files of a calibration.
 
+    Args:
+        root: folder of the shots.
+        settings: settings of the calibration.
+
     Attributes:
-        files: the shots of the polarizer, by name. pattern: pattern of the region, from its top-left pixel.
+        files: shots of the polarizer, by name.
+        pattern: pattern of the region, from its top-left pixel.
+
+    Raises:
+        PolarguideError: there are too few shots.
     """
 
     def __init__(self, root: Path, settings: CalibrateSettings) -> None:
-        """Find the files.
-
-        Raises:
-            PolarguideError: there are too few.
-        """
-        remedy = "Give the folder of the shots of the polarizer, one mosaic each."
-        require_folder(root, expected="a folder of raw mosaics", remedy=remedy)
+        require_folder(
+            root,
+            expected="a folder of raw mosaics",
+            remedy="Give the folder of the shots of the polarizer, one mosaic each.",
+        )
         self._settings = settings
         self._raw = RawFormat(settings.width, settings.height, settings.packing)
         self._flat = _files("--flat", settings.flat)
@@ -80,28 +106,28 @@ class Shots:
         others = {os.path.realpath(path) for path in (*self._flat, *self._dark)}
         paths = index_files(root, RAW_SUFFIXES)
         self.files = [paths[name] for name in sorted(paths) if os.path.realpath(paths[name]) not in others]
-        if len(self.files) < FEWEST:
-            raise PolarguideError(
-                root,
-                expected=f"at least {FEWEST} shots of the polarizer, at different angles",
-                found=f"{len(self.files)} ({describe_contents(root)})",
-                remedy="Take more; twelve, 15 degrees apart, are a good number.",
-            )
+        require(
+            len(self.files) >= FEWEST,
+            root,
+            expected=f"at least {FEWEST} shots of the polarizer, at different angles",
+            found=f"{len(self.files)} ({describe_contents(root)})",
+            remedy="Take more shots; twelve at steps of 15 degrees are a good number.",
+        )
         self.pattern: Pattern = sensor_pattern(settings.sensor).shifted(*settings.offset)
         self._first: tuple[Path, tuple[int, ...], Any] | None = None
         self._floor: Any = settings.black_level
 
     @property
     def size(self) -> tuple[int, int]:
-        """Width and height of the mosaics, once one has been read."""
+        """Width and height of the mosaics, after the first reading."""
         assert self._first is not None
         return self._first[1][1], self._first[1][0]
 
     def measure(self, reporter: Reporter) -> ShotMeans:
-        """Read all files once.
+        """Read all files, and compute their levels and means.
 
         Raises:
-            PolarguideError: one cannot be used: damaged, of another size, saturated, dark, not of a uniform light, ...
+            PolarguideError: a file is damaged, of another size, saturated, dark, or not of a uniform light.
         """
         files = [*self.files, *self._flat]
         period = self.pattern.period
@@ -109,55 +135,61 @@ class Shots:
         counts: list[NDArray[np.int64]] = []
         blocks: list[NDArray[Any]] = []
         stated: dict[Path, int | None] = {}
-        light = None
+        light: Any = 0
         with reporter.track("reading shots", len(files) + len(self._dark)) as advance:
             if self._dark:
                 total = sum(self._read(path).astype(np.float64) for path in self._dark)
                 self._floor = np.asarray(total / len(self._dark), np.float32)
+            dark = "dark frame" if self._dark else "black level"
+            left, top = self.pattern.cell_corner()
             for number, path in enumerate(files, 1):
                 values = self._read(path)
                 counts.append(np.bincount(values.ravel(), minlength=256))
                 if self._settings.bits is None:
                     stated[path] = self._raw.full_scale(path, values)
                 if number <= len(self.files):
-                    left, top = self.pattern.cell_corner()
                     blocks.append(sample_blocks(values[top:, left:], SIDE))
                 above = values.astype(np.float32) - np.float32(self._floor)
                 planes = (above[row::period, column::period] for row, column in np.ndindex(period, period))
                 sums.append(np.array([plane.mean(dtype=np.float64) for plane in planes]))
                 mean = float(above.mean())
-                if mean <= 0:
-                    dark = "dark frame" if self._dark else "black level"
-                    raise PolarguideError(
-                        path,
-                        expected=f"a shot that is brighter than the {dark}",
-                        found=f"a mean of {values.mean():.1f}, and {np.mean(self._floor):.1f} of the {dark}",
-                        remedy="Take the dark frame with the lens covered, at the same exposure and gain.",
-                    )
-                light = above / mean if light is None else light + above / mean
+                require(
+                    mean > 0,
+                    path,
+                    expected=f"a shot that is brighter than the {dark}",
+                    found=f"a mean of {values.mean():.1f}, and {np.mean(self._floor):.1f} of the {dark}",
+                    remedy="Take the dark frame with the lens covered, at the same exposure and gain.",
+                )
+                light = light + above / mean
                 advance(number + len(self._dark))
-        assert light is not None
         levels = self._levels(counts, agreed_full_scale(stated) if stated else None)
         for path, count in zip(files, counts, strict=True):
-            _require_exposed(path, count, levels)
+            share = float(count[levels.saturation :].sum() / count.sum())
+            require(
+                share <= SATURATED,
+                path,
+                expected=f"at most {SATURATED:.1%} saturated samples",
+                found=f"{share:.1%}",
+                remedy="Expose shorter: the brightest shot should stay below 90 % of full scale.",
+            )
         require_kind(self._settings.sensor, np.concatenate(blocks), levels)
         self._require_uniform(light)
         means = np.stack(sums) / (levels.white - levels.black)
         dim = int(means.mean(axis=1).argmin())
-        if means[dim].mean() < TOO_DARK:
-            raise PolarguideError(
-                files[dim],
-                expected=f"a mean intensity of at least {TOO_DARK:.0%} of full scale",
-                found=f"{means[dim].mean():.1%}",
-                remedy="Expose longer: half of full scale is good.",
-            )
+        require(
+            means[dim].mean() >= TOO_DARK,
+            files[dim],
+            expected=f"a mean intensity of at least {TOO_DARK:.0%} of full scale",
+            found=f"{means[dim].mean():.1%}",
+            remedy="Expose longer: half of full scale is good.",
+        )
         shots = len(self.files)
         return ShotMeans(levels, means[:shots], means[shots:].mean(axis=0) if self._flat else None)
 
     def linear(
         self, levels: Levels, reporter: Reporter
     ) -> Iterator[tuple[NDArray[np.float32], NDArray[np.bool_]]]:
-        """Read each shot once more: linear intensities [H, W], full scale 1, and a mask [H, W] of saturated samples."""
+        """Read each shot again: linear intensities [H, W] with full scale 1, and a mask [H, W] of saturated samples."""
         with reporter.track("fitting pixels", len(self.files)) as advance:
             for number, path in enumerate(self.files, 1):
                 values = self._read(path)
@@ -170,24 +202,23 @@ class Shots:
         if self._first is None:
             self._first = (path, values.shape, values.dtype)
         first, shape, kind = self._first
-        if (values.shape, values.dtype) != (shape, kind):
-            raise PolarguideError(
-                path,
-                expected=f"{shape[1]}x{shape[0]} pixels of {kind} like {first.name}",
-                found=f"{values.shape[1]}x{values.shape[0]} of {values.dtype}",
-                remedy="Take all shots, the dark frame and the flat field with the same region and depth.",
-            )
+        require(
+            (values.shape, values.dtype) == (shape, kind),
+            path,
+            expected=f"{shape[1]}x{shape[0]} pixels of {kind} like {first.name}",
+            found=f"{values.shape[1]}x{values.shape[0]} of {values.dtype}",
+            remedy="Take all shots, the dark frame and the flat field with the same region and depth.",
+        )
         return values
 
     def _levels(self, counts: list[NDArray[np.int64]], stated: int | None) -> Levels:
-        used = [np.flatnonzero(count) for count in counts]
-        largest = max(int(values[-1]) for values in used)
-        bits = int(np.bitwise_or.reduce(np.concatenate(used)))
+        """Estimate the levels from counts of stored values, and the full scale that files state."""
+        used = np.concatenate([np.flatnonzero(count) for count in counts])
         assert self._first is not None
         path, _, kind = self._first
         return estimate_levels(
-            largest,
-            bits,
+            int(used.max()),
+            int(np.bitwise_or.reduce(used)),
             self._raw.container(path, np.dtype(kind)),
             bits=self._settings.bits,
             black=0.0 if self._dark else self._settings.black_level,
@@ -196,12 +227,16 @@ class Shots:
         )
 
     def _require_uniform(self, light: NDArray[np.float32]) -> None:
-        """Refuse shots of a scene: light has to be alike over each neighborhood, and nowhere much dimmer."""
+        """Check that the light is uniform: without texture, and without dark parts.
+
+        Raises:
+            PolarguideError: the light is not uniform.
+        """
         left, top = self.pattern.cell_corner()
         step = self.pattern.period
         cut = light[top:, left:]
         cut = cut[: cut.shape[0] // step * step, : cut.shape[1] // step * step]
-        # Every place of the pattern has its own throughput and color.
+        # Each position of the pattern has its own throughput and color.
         cells = np.zeros((cut.shape[0] // step, cut.shape[1] // step))
         for row, column in np.ndindex(step, step):
             plane = cut[row::step, column::step]
@@ -213,45 +248,313 @@ class Shots:
         blocks = grid.reshape(rows * columns, side * side)
         means = blocks.mean(axis=1)
         low, high = np.percentile(means, [1, 99])
-        # A gradient is no texture: what a plane through a block explains is left out.
+        # A gradient is not texture: the plane through a block is subtracted.
         slope = (np.arange(side) + 0.5) / side - 0.5
         rest = blocks / means[:, None] - 1
         for tilt in (np.tile(slope, side), np.repeat(slope, side)):
             rest = rest - np.outer(rest @ tilt / (tilt @ tilt), tilt)
         texture = float(np.sqrt(np.mean(rest**2)))
-        if low < UNEVEN * high or texture > TEXTURED:
-            raise PolarguideError(
-                self.files[0].parent,
-                expected=f"a uniform light: its dimmest part above {UNEVEN:.0%}, texture below {TEXTURED:.0%}",
-                found=f"{low / high:.0%} of the brightest part in the dimmest, {texture:.0%} of texture",
-                remedy="Fill the field with a diffuser or an integrating sphere, out of focus, and all of it with the "
-                "polarizer.",
-            )
-
-
-def _require_exposed(path: Path, count: NDArray[np.int64], levels: Levels) -> None:
-    share = float(count[levels.saturation :].sum() / count.sum())
-    if share > SATURATED:
-        raise PolarguideError(
-            path,
-            expected=f"at most {SATURATED:.1%} saturated samples",
-            found=f"{share:.1%}",
-            remedy="Expose shorter: the brightest shot should stay below 90 % of full scale.",
+        require(
+            low >= UNEVEN * high and texture <= TEXTURED,
+            self.files[0].parent,
+            expected=f"a uniform light: its dimmest part above {UNEVEN:.0%}, texture below {TEXTURED:.0%}",
+            found=f"{low / high:.0%} of the brightest part in the dimmest, {texture:.0%} of texture",
+            remedy="Fill the field with the polarizer in front of a diffuser or an integrating sphere, out of focus.",
         )
 
 
 def _files(option: str, path: Path | None) -> list[Path]:
-    """A file, or those of a folder."""
-    if path is None:
-        return []
-    if not path.is_dir():
-        return [path]
+    """Return a file, or the files of a folder.
+
+    Raises:
+        PolarguideError: the folder has no mosaic.
+    """
+    if path is None or not path.is_dir():
+        return [] if path is None else [path]
     paths = list(index_files(path, RAW_SUFFIXES).values())
-    if not paths:
-        raise PolarguideError(
-            f"{option} {path}",
-            expected="a mosaic, or a folder of some",
-            found=describe_contents(path),
-            remedy="Leave it out, or give the files.",
-        )
+    require(
+        paths,
+        f"{option} {path}",
+        expected="a mosaic, or a folder of mosaics",
+        found=describe_contents(path),
+        remedy="Leave it out, or give the files.",
+    )
     return paths
+
+
+MISFIT = 0.02
+"""Relative deviation of the means from the fit above which the shots contradict each other."""
+SAME_ANGLE = np.radians(2.0)
+"""Largest difference of equal angles, radians."""
+NARROW = 0.15
+"""Smallest singular value of the directions of the shots; angles all around have 0.7."""
+POLARIZED = 0.5
+"""Smallest DoLP of a shot through a polarizer."""
+FLAT_POLARIZED = 0.1
+"""DoLP from which a flat field is certainly polarized. Gains of a sensor are smaller."""
+UNSTEADY = 0.15
+"""Largest change of the brightness by errors of a sensor (3 % of gain, extinction ratios of 20)."""
+LARGEST_ZERO = np.radians(10.0)
+"""Largest error of the zero of given angles, radians."""
+ALIKE = 0.9
+"""Smallest agreement of matching lists of angles; lists with a constant difference have 1."""
+
+
+@dataclass(frozen=True, eq=False)
+class ShotFit:
+    """Estimated angles and levels of the shots.
+
+    Attributes:
+        angles: angles of the polarizer, radians, [T].
+        levels: levels of the light behind the polarizer, [T], with mean 1.
+        vectors: analyzer vectors of the positions, [K, 3], in the unit of the means.
+        misfit: root mean square deviation of the means from the fit, as a share of their mean.
+        zero: mean deviation of the positions from their nominal angles before the choice of the zero, radians.
+        flat_dolp: DoLP of the flat field with the calibration, or None.
+    """
+
+    angles: Array
+    levels: Array
+    vectors: Array
+    misfit: float
+    zero: float
+    flat_dolp: float | None
+
+    def stokes(self, diattenuation: float) -> Array:
+        """Return the Stokes vectors of the light in the shots, [T, 3]."""
+        return _stokes(self.angles, self.levels, diattenuation)
+
+
+def solve_shots(
+    means: Array,
+    nominal: Array,
+    *,
+    known: Sequence[float] | None,
+    flat: Array | None,
+    diattenuation: float,
+    to_mean: bool,
+    files: Sequence[Path],
+) -> ShotFit:
+    """Estimate the angles and levels of the shots.
+
+    Args:
+        means: means of each shot by position, [T, K].
+        nominal: angles of the positions by their names, radians, [K].
+        known: angles of the polarizer, radians, [T]; None to estimate them.
+        flat: means of the flat field, [K], or None.
+        diattenuation: diattenuation of the polarizer, (E - 1) / (E + 1) for the extinction ratio E.
+        to_mean: choose the zero of the angles at which the positions have no mean deviation from their names.
+        files: files of the shots, for messages.
+
+    Raises:
+        PolarguideError: the shots are not polarized, have too few angles, or contradict the angles or each other, or
+            the flat field is polarized.
+    """
+    start = _pixel_stokes(means, nominal)
+    folder = files[0].parent
+    for path, stokes in zip(files, start, strict=True):
+        require(
+            _dolp(stokes) >= POLARIZED,
+            path,
+            expected=f"light through a polarizer, with a DoLP above {POLARIZED:.0%}",
+            found=f"{_dolp(stokes):.0%}",
+            remedy="Take it through the polarizer, and the --flat without it. Check --sensor and offsets.",
+        )
+    if flat is not None:
+        dolp = _dolp(_pixel_stokes(flat[None], nominal)[0])
+        require(
+            dolp <= FLAT_POLARIZED,
+            "--flat",
+            expected="unpolarized light",
+            found=f"a DoLP of {dolp:.0%}",
+            remedy="Take it without the polarizer, of a light behind a thick diffuser; no screen, no reflection.",
+        )
+    apparent = np.arctan2(start[:, 2], start[:, 1]) / 2
+    if known is not None:
+        _require_match(np.asarray(known), apparent, folder, to_mean)
+    elif flat is None:
+        _require_steady(start[:, 0], folder)
+    _require_different(apparent if known is None else np.asarray(known), folder, known is not None)
+    angles, levels = _refined(means, apparent, start[:, 0], known, flat, diattenuation)
+    levels = levels / levels.mean()
+    light = _stokes(angles, levels, diattenuation)
+    vectors = np.asarray(np.linalg.lstsq(light, means, rcond=None)[0].T, np.float64)
+    misfit = float(np.sqrt(np.mean((means - light @ vectors.T) ** 2)) / means.mean())
+    model = "the given angles"
+    remedy = (
+        "Check their order and zero; shots must be linear (no gamma, no automatic exposure within the list)."
+    )
+    if known is None:
+        model = "one steady, unpolarized light behind a turned polarizer"
+        remedy = "Give --flat (a picture without the polarizer) or --angles; do not change lamp and exposure."
+    require(
+        misfit <= MISFIT,
+        folder,
+        expected=f"shots that agree with {model} within {MISFIT:.0%}",
+        found=f"{misfit:.1%}",
+        remedy=remedy,
+    )
+    zero = _mean_deviation(vectors, nominal)
+    if to_mean:
+        angles = angles - zero
+        vectors = _turned(vectors, -zero)
+    flat_dolp = None if flat is None else _dolp(np.linalg.lstsq(vectors, flat, rcond=None)[0])
+    return ShotFit(np.mod(angles, np.pi), levels, vectors, misfit, zero, flat_dolp)
+
+
+def _dolp(stokes: NDArray[Any]) -> float:
+    return float(np.hypot(stokes[1], stokes[2]) / stokes[0])
+
+
+def _require_steady(brightness: Array, folder: Path) -> None:
+    """Check that the light is steady. Without angles and a flat field, its changes look like errors of the sensor.
+
+    Raises:
+        PolarguideError: the brightness of the shots differs too much.
+    """
+    change = float(brightness.max() / brightness.min()) - 1
+    require(
+        change <= UNSTEADY,
+        folder,
+        expected=f"one steady, unpolarized light, whose shots differ by at most {UNSTEADY:.0%} in brightness",
+        found=f"{change:.0%}: the lamp is polarized, or lamp or exposure changed",
+        remedy="Give --angles, or --flat (a picture without the polarizer), which measure the light of each shot.",
+    )
+
+
+def _stokes(angles: Array, levels: Array, diattenuation: float) -> Array:
+    """Return Stokes vectors behind a polarizer, [T, 3]."""
+    polarized = diattenuation * np.cos(2 * angles), diattenuation * np.sin(2 * angles)
+    return levels[:, None] * np.stack([np.ones_like(angles), *polarized], axis=1)
+
+
+def _pixel_stokes(means: Array, nominal: Array) -> Array:
+    """Return the Stokes vectors that ideal analyzers would measure, [T, 3], with equal levels of all colors."""
+    ideal = np.stack([malus(unit, nominal) for unit in np.eye(3)], axis=1)
+    balanced = means
+    if len(nominal) > 4:  # cells behind color filters
+        side = round(len(nominal) ** 0.5)
+        grid = means.reshape(len(means), side // 2, 2, side // 2, 2)
+        level = grid.mean(axis=(2, 4), keepdims=True)
+        balanced = (grid / level * level.mean(axis=(1, 3), keepdims=True)).reshape(means.shape)
+    return np.asarray(balanced @ np.linalg.pinv(ideal).T)
+
+
+def _refined(
+    means: Array,
+    apparent: Array,
+    brightness: Array,
+    known: Sequence[float] | None,
+    flat: Array | None,
+    diattenuation: float,
+) -> tuple[Array, Array]:
+    """Fit angles and levels by variable projection. The first level and the known angles, or the first, are fixed.
+
+    Args:
+        means: means of each shot by position, [T, K].
+        apparent, brightness: initial angles and levels, [T].
+        known, flat, diattenuation: as for ``solve_shots``.
+
+    Returns:
+        Angles and levels, [T].
+    """
+    count = len(means)
+    initial = apparent if known is None else np.asarray(known)
+    # Known angles determine the levels. A flat field is then a test, not a measurement.
+    with_flat = flat if known is None else None
+    data = means / means.mean()
+    initial_levels = brightness
+    if with_flat is not None:
+        data = np.concatenate([data, with_flat[None] / means.mean()])
+        initial_levels = np.append(brightness, with_flat.sum() / means.sum() * count * brightness.mean())
+    free_levels = known is not None or with_flat is not None
+    turns = count - 1 if known is None else 0
+
+    def unpacked(free: Array) -> tuple[Array, Array]:
+        angles = initial.copy()
+        levels = np.ones(len(data))
+        angles[count - turns :] = free[:turns]
+        if free_levels:
+            levels[1:] = np.exp(free[turns:])
+        return angles, levels
+
+    def deviations(free: Array) -> Array:
+        angles, levels = unpacked(free)
+        light = _stokes(angles, levels[:count], diattenuation)
+        if with_flat is not None:
+            light = np.concatenate([light, [[levels[count], 0.0, 0.0]]])
+        basis, _ = np.linalg.qr(light)
+        return np.asarray((data - basis @ (basis.T @ data)).ravel())
+
+    begin = initial[count - turns :]
+    if free_levels:
+        begin = np.append(begin, np.log(initial_levels[1:] / initial_levels[0]))
+    if len(begin):
+        solution: Any = least_squares(deviations, begin, xtol=1e-12, ftol=1e-14, gtol=1e-14, max_nfev=500)
+        begin = solution.x
+    angles, levels = unpacked(begin)
+    return angles, levels[:count]
+
+
+def _require_different(angles: Array, folder: Path, known: bool) -> None:
+    """Check the number and the spread of the angles.
+
+    Raises:
+        PolarguideError: the angles are too few or too similar.
+    """
+    ordered = np.sort(np.mod(angles, np.pi))
+    gaps = np.diff(np.append(ordered, ordered[0] + np.pi))
+    different = max(1, int((gaps > SAME_ANGLE).sum()))
+    directions = np.stack([np.ones_like(angles), np.cos(2 * angles), np.sin(2 * angles)], axis=1)
+    least = float(np.linalg.svd(directions / np.sqrt(len(angles)), compute_uv=False)[-1])
+    span = np.degrees(np.pi - gaps.max())
+    require(
+        different >= FEWEST and least >= NARROW,
+        "--angles" if known else folder,
+        expected=f"at least {FEWEST} different angles of the polarizer, spread over 180 degrees",
+        found=f"{different} different angles over {span:.0f} degrees"
+        if different > 1
+        else f"{len(angles)} shots at one angle",
+        remedy="Turn the polarizer between the shots; twelve shots at steps of 15 degrees are a good number.",
+    )
+
+
+def _require_match(known: Array, apparent: Array, folder: Path, to_mean: bool) -> None:
+    """Check that given angles match the apparent angles.
+
+    Raises:
+        PolarguideError: the given angles have the other sense or another zero, or belong to other shots.
+    """
+    along, against = (np.mean(np.exp(2j * (apparent - sign * known))) for sign in (1, -1))
+    other_sense = abs(against) >= ALIKE
+    require(
+        abs(along) >= ALIKE,
+        "--angles",
+        expected="angles that match the sensor",
+        found=f"angles that look like {', '.join(f'{np.degrees(a) % 180:.0f}' for a in apparent[:8])}, ...",
+        remedy="Give the other --sense: the angles count in the opposite direction."
+        if other_sense
+        else "List the angles in the order of the files' names.",
+    )
+    zero = float(np.angle(along)) / 2
+    require(
+        abs(zero) <= LARGEST_ZERO or to_mean,
+        "--angles",
+        expected="angles from the image's horizontal, counter-clockwise as displayed",
+        found=f"a zero that differs by {-np.degrees(zero):+.1f} degrees from the sensor in {folder}",
+        remedy="Give angles from the horizontal, or --reference mean for the zero of the sensor's mean.",
+    )
+
+
+def _mean_deviation(vectors: Array, nominal: Array) -> float:
+    """Return the circular mean of the deviations of the positions' angles from their names, in radians."""
+    angles = np.arctan2(vectors[:, 2], vectors[:, 1]) / 2
+    return float(np.angle(np.mean(np.exp(2j * (angles - nominal))))) / 2
+
+
+def _turned(vectors: Array, angle: float) -> Array:
+    """Rotate analyzer vectors [K, 3] by an angle in radians."""
+    cosine = np.cos(2 * angle)
+    sine = np.sin(2 * angle)
+    s0, s1, s2 = vectors.T
+    return np.stack([s0, s1 * cosine - s2 * sine, s1 * sine + s2 * cosine], axis=1)

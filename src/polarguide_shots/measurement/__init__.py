@@ -1,1 +1,1 @@
-"""Inspection lines: figures of regions of many shots, their limits, and a golden part to compare with."""
+"""Measurement of shots: figures of regions, limits, and a golden part, for inspection lines."""

@@ -1,4 +1,4 @@
-"""Measure shots, one after the other: what regions, limits and a reference make of their maps, into a table or none."""
+"""Measurement of shots: figures of regions, limits and a reference, with or without a table."""
 
 from __future__ import annotations
 
@@ -15,37 +15,41 @@ import msgspec
 from polarguide.capture.exposures import Angle
 from polarguide.capture.view import ANGLES
 from polarguide.capture.view_reader import Array
-from polarguide.core.errors import PolarguideError
+from polarguide.core.errors import PolarguideError, require
 from polarguide.core.files import make_folder, require_inside
 from polarguide.core.options import PathLike
 from polarguide.core.progress import SILENT, Reporter
 from polarguide.visualization.figures import write_png
 from polarguide_shots.exposures import find_shots, require_elsewhere
 from polarguide_shots.maps import ShotMaps
-from polarguide_shots.measurement.fields import (
-    FORMAT,
-    KEYS,
-    NO_LIMITS,
-    Status,
-    Value,
-    faults,
-    read_limits,
-    verdict,
-    worst,
-)
 from polarguide_shots.measurement.pictures import difference_picture, regions_picture
 from polarguide_shots.measurement.regions import (
     WHOLE,
     Differences,
-    Reference,
     Region,
     box_of,
     difference_figures,
     parse_regions,
     placed,
+    read_reference,
     region_figures,
+    subtract,
 )
-from polarguide_shots.measurement.table import Entry, FileStamp, Table, stamps
+from polarguide_shots.measurement.table import (
+    FORMAT,
+    KEYS,
+    NO_LIMITS,
+    Entry,
+    FileStamp,
+    Status,
+    Table,
+    Value,
+    faults,
+    read_limits,
+    stamps,
+    verdict,
+    worst,
+)
 from polarguide_shots.options import MeasureOptions, ShotOptions
 from polarguide_shots.read import (
     NAME,
@@ -62,12 +66,14 @@ from polarguide_shots.sets import ExposureSet
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class MeasuredShot:
-    """A shot that was measured.
+    """A measured shot.
 
     Attributes:
-        maps: of it. differences: to the reference, None without one.
-        regions: by ``Field.key``, from ``region`` on. status: the worst of them.
-        beyond: all regions with the limits that they are beyond; empty if all regions are within.
+        maps: maps of the shot.
+        differences: differences to the reference, or None.
+        regions: figures of the regions by ``Field.key``, from ``region`` on.
+        status: worst status of the regions.
+        beyond: all regions with their exceeded limits; empty if all regions are within their limits.
     """
 
     maps: ShotMaps
@@ -77,19 +83,22 @@ class MeasuredShot:
     beyond: Sequence[tuple[Region, Sequence[str]]]
 
     def entry(self, files: tuple[FileStamp, ...] = (), picture: str = "") -> Entry:
-        """Its line of the table."""
+        """Return the line of the table."""
         return Entry(FORMAT, self.maps.name, files, self.status, "", self.maps.notes, self.regions, picture)
 
 
 class Measurer:
-    """Everything that stays the same from shot to shot."""
+    """Regions, limits and reference of many shots.
+
+    Args:
+        options: quantities to measure, and their limits.
+        reading: options of reading.
+
+    Raises:
+        PolarguideError: an option, the limits or the reference are invalid.
+    """
 
     def __init__(self, options: MeasureOptions, reading: ShotOptions) -> None:
-        """Check the options, read limits and reference.
-
-        Raises:
-            PolarguideError: one of them is wrong.
-        """
         self._reading = reading.checked()
         check_files(self._reading)
         self._options = options
@@ -100,17 +109,17 @@ class Measurer:
             self.limits = read_limits(options.limits, names, reference=options.reference is not None)
         self.reference = None
         if options.reference is not None:
-            self.reference = Reference.read(options.reference, self._reading)
+            self.reference = read_reference(options.reference, self._reading)
             placed(self._regions, self.reference.size, options.reference)
         self._part = None if self.reference is not None else box_of(self._regions)
 
     @property
     def reference_files(self) -> tuple[Path, ...]:
-        """Files that are compared with, and not measured where they lie in a watched folder."""
-        return () if self.reference is None else self.reference.shot.paths
+        """Files of the reference, which are not measured in a watched folder."""
+        return () if self.reference is None else self.reference.files
 
     def read(self, shot: ExposureSet, *, whole: bool = False) -> ShotMaps:
-        """The maps of a shot: of the whole picture if ``whole`` or with a reference, else at least of the regions.
+        """Read the maps of a shot: of the regions at least, or of the whole picture if requested or with a reference.
 
         Raises:
             PolarguideError, OSError, MemoryError: the shot cannot be read.
@@ -118,55 +127,53 @@ class Measurer:
         return read_shot(shot, self._reading, part=None if whole else self._part)
 
     def measured(self, shot: ExposureSet, maps: ShotMaps) -> MeasuredShot:
-        """The figures of its maps.
+        """Compute the figures of the maps of a shot.
 
         Raises:
             PolarguideError: the shot does not fit the regions or the reference.
         """
         regions = placed(self._regions, maps.whole or maps.size, shot.where)
-        differences = None if self.reference is None else self.reference.differences(maps)
-        measured = [self._region(maps, region, differences) for region in regions]
-        status = worst([figures for _, figures, _ in measured])
-        beyond = [(region, which) for region, _, which in measured] if status == "beyond" else []
-        return MeasuredShot(maps, differences, tuple(figures for _, figures, _ in measured), status, beyond)
+        differences = None if self.reference is None else subtract(maps, self.reference)
+        figures = []
+        beyond = []
+        for region in regions:
+            local = dataclasses.replace(region, x=region.x - maps.origin[0], y=region.y - maps.origin[1])
+            values: dict[str, Value] = {
+                "region": region.name,
+                "x": region.x,
+                "y": region.y,
+                "width": region.width,
+                "height": region.height,
+                "status": None,
+                "why": None,
+                **region_figures(maps, local, self._options.threshold),
+                **difference_figures(differences, local),
+            }
+            bounds = self.limits.of(region.name)
+            beyond.append((region, faults(values, bounds)))
+            figures.append({**values, **verdict(beyond[-1][1], bounds)})
+        status = worst(figures)
+        return MeasuredShot(maps, differences, tuple(figures), status, beyond if status == "beyond" else [])
 
     def entry(self, shot: ExposureSet) -> Entry:
-        """The line of a shot, which says why where it cannot be measured."""
+        """Return the line of a shot, or of an error."""
         try:
             return self.measured(shot, self.read(shot)).entry()
         except UNREADABLE as error:
             return unread_entry(shot, (), error)
 
-    def _region(
-        self, maps: ShotMaps, region: Region, differences: Differences | None
-    ) -> tuple[Region, dict[str, Value], list[str]]:
-        local = dataclasses.replace(region, x=region.x - maps.origin[0], y=region.y - maps.origin[1])
-        figures = {
-            **region_figures(maps, local, self._options.threshold),
-            **difference_figures(differences, local),
-        }
-        bounds = self.limits.of(region.name)
-        beyond = faults(figures, bounds)
-        head: dict[str, Value] = {
-            "region": region.name,
-            "x": region.x,
-            "y": region.y,
-            "width": region.width,
-            "height": region.height,
-        }
-        return region, {**head, **verdict(beyond, bounds), **figures}, beyond
-
-    def judged(self, entry: Entry) -> Entry:
-        """A line of a table by the limits; its figures do not change."""
+    def judge(self, entry: Entry) -> Entry:
+        """Compare a line of a table with the limits. Its figures do not change."""
         regions = []
         for figures in entry.regions:
             bounds = self.limits.of(str(figures["region"]))
             regions.append({**figures, **verdict(faults(figures, bounds), bounds)})
-        status = worst(regions) if regions else entry.status
-        return msgspec.structs.replace(entry, status=status, regions=tuple(regions))
+        return msgspec.structs.replace(
+            entry, status=worst(regions) if regions else entry.status, regions=tuple(regions)
+        )
 
     def settings(self) -> dict[str, Any]:
-        """The settings that the figures depend on, as JSON."""
+        """Return the settings that the figures depend on, as JSON data."""
         reading = {f.name: getattr(self._reading, f.name) for f in dataclasses.fields(self._reading)}
         settings = {
             "reading": reading,
@@ -183,10 +190,12 @@ class Measurer:
 
 
 def unread_entry(shot: ExposureSet, files: tuple[FileStamp, ...], error: BaseException) -> Entry:
-    """The line of a shot that cannot be measured.
+    """Return the line of a shot that cannot be measured.
 
     Args:
-        shot: the shot. files: ``stamps`` of its files. error: why, one of ``UNREADABLE``.
+        shot: the shot.
+        files: ``stamps`` of its files.
+        error: one of ``UNREADABLE``.
     """
     return Entry(FORMAT, shot.name, files, "unread", str(fault_of(shot, error)), (), ())
 
@@ -196,24 +205,25 @@ BEYOND = "beyond"
 DIFFERENCES = "differences"
 """Folder of pictures of differences."""
 Heard = Callable[[Entry], None]
+"""Callback for the line of each shot."""
 
 
 def ignore(entry: Entry) -> None:
-    """Hear nothing."""
+    """Ignore the line of a shot, as the default callback."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Outcome:
-    """The outcome of a command.
+    """Result of a command.
 
     Attributes:
-        folder: folder of the table; None where nothing was written.
-        counts: shots by status. Of ``measure_shots`` these are all it was given, those included that were in the table
-            before; of ``watch_folder`` those that came while it watched.
-        earlier: how many were in the table before; 0 of ``watch_folder``.
-        waiting: shots of a watched folder that were not complete when it stopped.
-        trouble: why no shot was found in a watched folder in the end, though it is not empty; else "".
-        entries: lines of the table, where nothing was written.
+        folder: folder of the table; None without a table.
+        counts: numbers of shots by status: all shots of ``measure_shots``, including shots that were in the table
+            before; new shots of ``watch_folder``.
+        earlier: number of shots that were in the table before; 0 for ``watch_folder``.
+        waiting: names of incomplete shots of a watched folder.
+        trouble: reason why no shot was found in a watched folder that is not empty; else empty.
+        entries: lines of the shots without a table.
     """
 
     folder: Path | None
@@ -225,48 +235,53 @@ class Outcome:
 
     @property
     def rows(self) -> list[dict[str, Value]]:
-        """The ``entries`` as records, one a region, with the fields of the table; ``pandas.DataFrame`` takes them."""
+        """Records of all regions of ``entries``, with the fields of the table, for ``pandas.DataFrame``."""
         return [dict(zip(KEYS, row, strict=True)) for entry in self.entries for row in entry.rows()]
 
     @property
     def exit_status(self) -> int:
-        """3 if a shot is beyond a limit, else 2 if one was not read, else 0."""
+        """3 if a shot is beyond a limit, else 2 if a shot was not read, else 0."""
         if self.counts["beyond"]:
             return 3
         return 2 if self.counts["unread"] or self.waiting or self.trouble else 0
 
 
 class ChangedWhileRead(PolarguideError):
-    """A file was written to while it was read."""
+    """The error of a file that was written to while it was read."""
 
 
 class Line(contextlib.AbstractContextManager["Line"]):
-    """A ``Measurer`` and the table that it writes into. Use it as a context: it holds the table open."""
+    """A ``Measurer`` with an open table. The context manager closes the table.
+
+    Args:
+        out: folder of the table.
+        options: quantities to measure, and their limits.
+        reading: options of reading.
+
+    Raises:
+        PolarguideError: an option, the limits, the reference or the table are invalid.
+    """
 
     def __init__(self, out: Path, options: MeasureOptions, reading: ShotOptions) -> None:
-        """Check the options, read limits and reference, open the table.
-
-        Raises:
-            PolarguideError: one of them is wrong.
-        """
         self.measurer = Measurer(options, reading)
         self.out = out
         require_inside(out, out / BEYOND, out / DIFFERENCES)
         self.table = Table(
-            out, self.measurer.settings(), overwrite=options.overwrite, judged=self.measurer.judged
+            out, self.measurer.settings(), overwrite=options.overwrite, judge=self.measurer.judge
         )
 
     def __exit__(self, *_: object) -> None:
         self.table.close()
 
     def measure(self, shot: ExposureSet, files: tuple[FileStamp, ...]) -> Entry:
-        """Measure a shot, draw what is to be drawn, and write its line.
+        """Measure a shot, draw its pictures, and write its line.
 
         Args:
-            shot: the shot. files: ``stamps`` of its files.
+            shot: the shot.
+            files: ``stamps`` of its files.
 
         Raises:
-            ChangedWhileRead: they have become others meanwhile; nothing was written.
+            ChangedWhileRead: a file has changed. Nothing was written.
             PolarguideError, OSError, MemoryError: the shot cannot be read, or does not fit regions or reference.
         """
         maps = self.measurer.read(shot)
@@ -278,18 +293,15 @@ class Line(contextlib.AbstractContextManager["Line"]):
                 remedy="Repeat the command when it is complete; --watch waits for that.",
             )
         measured = self.measurer.measured(shot, maps)
-        entry = measured.entry(files, self._draw(shot, measured))
-        self.table.add(entry)
-        return entry
+        # A line in the table implies that its pictures exist.
+        return self.table.add(measured.entry(files, self._draw(shot, measured)))
 
     def unread(self, shot: ExposureSet, files: tuple[FileStamp, ...], error: BaseException) -> Entry:
         """Write the line of a shot that cannot be measured."""
-        entry = unread_entry(shot, files, error)
-        self.table.add(entry)
-        return entry
+        return self.table.add(unread_entry(shot, files, error))
 
     def _draw(self, shot: ExposureSet, measured: MeasuredShot) -> str:
-        """Write pictures before the line of the table: where that is, they are. Their name, "" if there are none."""
+        """Write the pictures of a shot, and return their name; empty without pictures."""
         reference = self.measurer.reference
         if not measured.beyond and reference is None:
             return ""
@@ -309,20 +321,19 @@ class Line(contextlib.AbstractContextManager["Line"]):
         write_png(self.out / BEYOND / f"{name}.png", picture)
 
     def follow_judgment(self, shot: ExposureSet, entry: Entry) -> None:
-        """Draw the picture of a shot that other limits than before call beyond, or remove that of one within.
+        """Draw or remove the picture of a shot after a change of the limits.
 
         Raises:
-            PolarguideError, OSError, MemoryError: the shot cannot be read again, or the picture not written.
+            PolarguideError, OSError, MemoryError: the shot cannot be read, or the picture cannot be written.
         """
         if entry.status == "beyond":
-            measured = self.measurer.measured(shot, self.measurer.read(shot))
-            self._draw_beyond(shot, measured, entry.picture)
+            self._draw_beyond(shot, self.measurer.measured(shot, self.measurer.read(shot)), entry.picture)
         elif entry.picture:
             (self.out / BEYOND / f"{entry.picture}.png").unlink(missing_ok=True)
 
 
 Source = PathLike | ExposureSet | Array | Sequence[Array]
-"""What a shot is measured of: files or folders, or the array of one shot as ``read_shot`` takes it."""
+"""A file or folder, a result of ``find_shots``, or the array of one shot (see ``read_shot``)."""
 
 
 def measure_shots(
@@ -335,20 +346,20 @@ def measure_shots(
     heard: Heard = ignore,
     reporter: Reporter = SILENT,
 ) -> Outcome:
-    """Measure shots: into the table of a folder, where those that are in it already are not measured again, or without
-    any file.
+    """Measure shots, with or without a table. Shots that are in the table are not measured again.
 
     Args:
-        paths: files and folders, as ``shots.exposures.find_shots`` takes them; or shots in memory, one array each, as
-            ``read_shot`` takes them, called array-1, array-2, ... or by their names in a mapping. An iterator of arrays
-            is measured as it delivers them.
-        out: folder of ``table.csv``, ``table.jsonl`` and pictures; None: nothing is written.
-        options: what is measured. reading: how shots are read. angles: of arrays that are pictures through a filter.
-        heard: is called with each shot when its line is on disk, or without a folder when it is measured.
-        reporter: takes progress.
+        paths: files and folders (see ``find_shots``), or one array for each shot (see ``read_shot``). Arrays have the
+            names of a mapping, or array-1, array-2, ... An iterator of arrays is consumed one by one.
+        out: folder of ``table.csv``, ``table.jsonl`` and pictures; None: no table.
+        options: quantities to measure, and their limits.
+        reading: options of reading.
+        angles: angles of arrays with pictures through a filter.
+        heard: callback for each shot, after its line is on disk, or without a table after its measurement.
+        reporter: receiver of progress and messages.
 
     Returns:
-        What was done; without a folder, its ``entries`` are the lines of the table, and ``rows`` the same as records.
+        The result. Without a table, it has the lines as ``entries`` and ``rows``.
 
     Example:
         >>> regions = polarguide.MeasureOptions(roi=("pin=120,80,40,40",))              # doctest: +SKIP
@@ -357,8 +368,8 @@ def measure_shots(
         0.213
 
     Raises:
-        PolarguideError: there is no shot, an option is wrong, an array is no shot, or the table cannot be
-            written. A shot that cannot be read raises nothing: its line says why.
+        PolarguideError: there is no shot, an option is invalid, an array is not a shot, or the table cannot be written.
+            A shot that cannot be read does not raise an error. Its line has the reason.
     """
     shots, total = _shots_of(paths, out, reading, angles)
     counts: Counter[str] = Counter()
@@ -368,7 +379,9 @@ def measure_shots(
         line = stack.enter_context(Line(Path(out), options, reading)) if out is not None else None
         measurer = line.measurer if line is not None else Measurer(options, reading)
         if line is not None and line.table.judged_again:
-            reporter.say(f"{out}: {line.table.judged_again} shots judged by other limits; their figures stay")
+            reporter.say(
+                f"{out}: {line.table.judged_again} shots compared with new limits; their figures are kept"
+            )
         advance = stack.enter_context(reporter.track("measure", total))
         for number, shot in enumerate(shots, 1):
             if line is None:
@@ -376,24 +389,24 @@ def measure_shots(
                 entries.append(entry)
                 heard(entry)
             else:
-                known, entry = _measured_into(line, shot, heard)
+                known, entry = _measure_into(line, shot, heard)
                 earlier += known
             counts[entry.status] += 1
             advance(number)
         if line is not None:
-            line.table.require_there()
+            line.table.require_present()
     return Outcome(None if out is None else Path(out), counts, earlier, entries=tuple(entries))
 
 
-def _measured_into(line: Line, shot: ExposureSet, heard: Heard) -> tuple[bool, Entry]:
-    """Measure a shot into a table that does not have it; whether it had, and the line."""
+def _measure_into(line: Line, shot: ExposureSet, heard: Heard) -> tuple[bool, Entry]:
+    """Measure a shot unless it is in the table. Return True if it was in the table, and the line."""
     files: tuple[FileStamp, ...] = ()
     with contextlib.suppress(OSError):
         files = stamps(shot.paths)
     known = line.table.entry_of(files) if files else None
     if known is not None:
         if line.table.judged_again:
-            with contextlib.suppress(*UNREADABLE):  # its line is there; only the picture is not
+            with contextlib.suppress(*UNREADABLE):  # the line is more important than the picture
                 line.follow_judgment(shot, known)
             if known.status == "beyond":
                 heard(known)
@@ -412,29 +425,33 @@ def _shots_of(
     reading: ShotOptions,
     angles: Sequence[Angle],
 ) -> tuple[Iterable[ExposureSet], int | None]:
-    """The shots, and how many there are where that is known."""
+    """Return the shots, and their number or None for an iterator.
+
+    Raises:
+        PolarguideError: there is no shot, or an array is not a shot.
+    """
     if isinstance(paths, Mapping):
         named = [array_shot(stacked_array(a, name), reading, angles, name) for name, a in paths.items()]
         return named, len(named)
-    if is_array(paths) and not isinstance(paths, list | tuple):
-        raise PolarguideError(
-            "paths",
-            expected="several shots",
-            found="one array",
-            remedy="Put it into a list: measure([array]).",
-        )
+    require(
+        isinstance(paths, list | tuple) or not is_array(paths),
+        "paths",
+        expected="several shots",
+        found="one array",
+        remedy="Put it into a list: measure([array]).",
+    )
     if not isinstance(paths, Sequence):
         return (_array_set(shot, number, reading, angles) for number, shot in enumerate(paths, 1)), None
     if paths and all(isinstance(shot, ExposureSet) or is_array(shot) for shot in paths):
         return [_array_set(shot, number, reading, angles) for number, shot in enumerate(paths, 1)], len(paths)
     files = [path for path in paths if isinstance(path, str | os.PathLike)]
-    if len(files) < len(paths):
-        raise PolarguideError(
-            "paths",
-            expected="files, or arrays",
-            found="both, or neither",
-            remedy="Measure files and arrays by calls of their own.",
-        )
+    require(
+        len(files) == len(paths),
+        "paths",
+        expected="files, or arrays",
+        found="both, or neither",
+        remedy="Measure files and arrays in separate calls.",
+    )
     if out is not None:
         require_elsewhere(files, Path(out))
     shots = find_shots(files, reading)
@@ -442,6 +459,11 @@ def _shots_of(
 
 
 def _array_set(shot: Source, number: int, reading: ShotOptions, angles: Sequence[Angle]) -> ExposureSet:
+    """Return the exposure set of an array, or a set unchanged.
+
+    Raises:
+        PolarguideError: the array is not a shot.
+    """
     if isinstance(shot, ExposureSet):
         return shot
     name = f"{NAME}-{number}"

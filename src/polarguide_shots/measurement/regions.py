@@ -1,11 +1,11 @@
-"""Regions of interest, the figures of one region of one shot, and its differences to a golden part."""
+"""Regions of interest, their figures in a shot, and differences to a golden part."""
 
 from __future__ import annotations
 
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -15,33 +15,34 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polarguide.capture.layout import angle_of_folder
-from polarguide.core.errors import PolarguideError
+from polarguide.core.errors import PolarguideError, require
 from polarguide.core.records import shortened
 from polarguide_shots.exposures import find_shots
-from polarguide_shots.maps import Map, Reason, ShotMaps
-from polarguide_shots.measurement.fields import COMPARED, DIFFERENCE_PERCENTILE, PERCENTILES, Value
+from polarguide_shots.maps import Map, Part, Reason, ShotMaps
+from polarguide_shots.measurement.table import COMPARED, DIFFERENCE_PERCENTILE, PERCENTILES, Value
 from polarguide_shots.options import ShotOptions
 from polarguide_shots.read import read_shot
-from polarguide_shots.sets import ExposureSet
 
 WHOLE = "all"
-"""The region that is measured where none is given."""
+"""Name of the default region, the whole picture."""
 _NAME = r"(?:(?P<name>[^=]*)=)?"
 _FORM = re.compile(_NAME + r"(?P<numbers>-?[0-9]{1,9}(?:,-?[0-9]{1,9}){3})")
 _POLYGON = re.compile(_NAME + r"(?P<corners>[0-9]{1,7},[0-9]{1,7}(?:;[0-9]{1,7},[0-9]{1,7}){2,99})")
 _OUTSIDE = 255
-"""In place of a ``Reason``, of pixels of a rectangle that are not of the polygon in it."""
+"""Placeholder of a ``Reason`` for pixels of a rectangle outside of its polygon."""
 _LONGEST_NAME = 64
 _MOST = 1_000_000
 
 
 @dataclass(frozen=True)
 class Region:
-    """A rectangle of pixels, its top-left corner included, ``x + width`` and ``y + height`` not; or a polygon in it.
+    """A rectangle of pixels, or a polygon in it.
 
     Attributes:
-        name, x, y, width, height: those of the rectangle.
-        corners: corners of the polygon, relative to the rectangle's top-left corner; none: the rectangle itself.
+        name: name of the region.
+        x, y: left column and top row of the rectangle.
+        width, height: size of the rectangle.
+        corners: corners of the polygon relative to the rectangle's top-left corner; empty for a rectangle.
     """
 
     name: str
@@ -53,18 +54,21 @@ class Region:
 
     @property
     def inside(self) -> NDArray[np.bool_] | None:
-        """Pixels of the rectangle whose centers lie in the polygon, [height, width]; None: all."""
+        """Mask of the pixels whose centers are in the polygon, [height, width]; None: all pixels."""
         return _filled(self.corners, self.width, self.height) if self.corners else None
 
     @property
     def place(self) -> tuple[slice, slice]:
-        """Its rows and columns."""
+        """Rows and columns of the rectangle."""
         return slice(self.y, self.y + self.height), slice(self.x, self.x + self.width)
 
 
 @lru_cache(maxsize=64)
 def _filled(corners: tuple[tuple[int, int], ...], width: int, height: int) -> NDArray[np.bool_]:
-    """Pixels with an odd number of edges of a polygon to their right, [height, width]; not to be written to."""
+    """Return a mask of the pixels with an odd number of edges of a polygon to their right, [height, width].
+
+    The mask is cached and must not be modified.
+    """
     y, x = np.mgrid[0:height, 0:width] + 0.5
     inside = np.zeros((height, width), bool)
     for (x0, y0), (x1, y1) in zip(corners, (*corners[1:], corners[0]), strict=True):
@@ -74,29 +78,33 @@ def _filled(corners: tuple[tuple[int, int], ...], width: int, height: int) -> ND
 
 
 def parse_regions(texts: Sequence[str]) -> tuple[Region, ...]:
-    """Regions as the command line states them: ``x,y,width,height``, or the corners ``x,y;x,y;x,y`` of a polygon; each
-    with ``name=`` before it.
+    """Parse regions ``x,y,width,height`` or corners ``x,y;x,y;x,y`` of a polygon, optionally with ``name=`` before.
 
-    Those without a name are called roi1, roi2, ... by their place among all.
+    Regions without a name are called roi1, roi2, ... by their position.
 
     Raises:
-        PolarguideError: one has another form or no pixel, or two have one name.
+        PolarguideError: a text is invalid, a region has no pixel, or two regions have one name.
     """
     regions: dict[str, Region] = {}
     for number, text in enumerate(texts, 1):
         region = _parse(text, number)
-        if region.name in regions:
-            raise PolarguideError(
-                "--roi",
-                expected="one region of each name",
-                found=f"{region.name} twice",
-                remedy="Rename one of them.",
-            )
+        require(
+            region.name not in regions,
+            "--roi",
+            expected="one region of each name",
+            found=f"{region.name} twice",
+            remedy="Rename one of them.",
+        )
         regions[region.name] = region
     return tuple(regions.values())
 
 
 def _parse(text: str, number: int) -> Region:
+    """Parse one region; ``number`` is its position.
+
+    Raises:
+        PolarguideError: the text is invalid, or the region has no pixel.
+    """
     match = _FORM.fullmatch(text.strip()) or _POLYGON.fullmatch(text.strip())
     if match is None:
         expected = "x,y,width,height, or corners x,y;x,y;x,y, in whole pixels, also as name=..."
@@ -113,7 +121,11 @@ def _parse(text: str, number: int) -> Region:
 
 
 def _polygon(name: str, corners: Sequence[tuple[int, ...]], text: str) -> Region:
-    """A polygon of corners (x, y) in pixels of the maps."""
+    """Create a polygon with corners (x, y) in pixels of the maps.
+
+    Raises:
+        PolarguideError: the polygon has no pixel.
+    """
     left, top = np.min(corners, axis=0).tolist()
     width, height = np.ptp(corners, axis=0).tolist()
     region = Region(name, left, top, width, height, tuple((x - left, y - top) for x, y in corners))
@@ -132,50 +144,56 @@ def _wrong(expected: str, found: str) -> PolarguideError:
 
 
 def placed(regions: Sequence[Region], size: tuple[int, int], where: Path | str) -> tuple[Region, ...]:
-    """The regions of a picture of this width and height; the whole picture where there are none.
+    """Return the regions of a picture, by default the whole picture.
+
+    Args:
+        regions: the requested regions.
+        size: width and height of the picture.
+        where: the shot, for messages.
 
     Raises:
-        PolarguideError: one reaches beyond the picture.
+        PolarguideError: a region exceeds the picture.
     """
     width, height = size
     for region in regions:
-        if region.x + region.width > width or region.y + region.height > height:
-            raise PolarguideError(
-                where,
-                expected=f"the region {region.name} within {width}x{height} pixels",
-                found=f"{region.x},{region.y},{region.width},{region.height}",
-                remedy="Make the region smaller, or move it; --roi counts pixels of the developed picture.",
-            )
+        require(
+            region.x + region.width <= width and region.y + region.height <= height,
+            where,
+            expected=f"the region {region.name} within {width}x{height} pixels",
+            found=f"{region.x},{region.y},{region.width},{region.height}",
+            remedy="Make the region smaller, or move it; --roi counts pixels of the developed picture.",
+        )
     return tuple(regions) or (Region(WHOLE, 0, 0, width, height),)
 
 
-def box_of(regions: Sequence[Region]) -> tuple[int, int, int, int] | None:
-    """The smallest rectangle around regions: x, y, width, height; None where there are none."""
+def box_of(regions: Sequence[Region]) -> Part | None:
+    """Return the smallest rectangle around regions, or None without regions."""
     if not regions:
         return None
-    left = min(r.x for r in regions)
-    top = min(r.y for r in regions)
-    width = max(r.x + r.width for r in regions) - left
-    return left, top, width, max(r.y + r.height for r in regions) - top
+    left, top = np.min([(r.x, r.y) for r in regions], axis=0).tolist()
+    right, bottom = np.max([(r.x + r.width, r.y + r.height) for r in regions], axis=0).tolist()
+    return left, top, right - left, bottom - top
 
 
 Floats = NDArray[np.floating[Any]]
 
 
 def region_figures(maps: ShotMaps, region: Region, threshold: float) -> dict[str, Value]:
-    """Counts, S0, DoLP and AoLP of a region; None where it has no pixel to take a figure from.
+    """Compute counts, S0, DoLP and AoLP of a region.
 
-    Means and standard deviations (over n, not n - 1) are computed in float64. AoLP is axial: with doubled angles,
-    C = mean cos 2a and S = mean sin 2a over usable pixels, R = sqrt(C^2 + S^2), the mean is atan2(S, C) / 2, the
-    standard deviation sqrt(-2 ln R) / 2 (Mardia and Jupp 2000, "Directional Statistics"). Standard errors of the
-    means are those of the sensor's noise alone, of pixels that share samples where they were interpolated.
+    Means and standard deviations (over n, not n - 1) are computed in float64. AoLP is axial. Let C = mean cos 2a and
+    S = mean sin 2a over usable pixels, and R = sqrt(C^2 + S^2). The mean is atan2(S, C) / 2, and the standard deviation
+    is sqrt(-2 ln R) / 2 (Mardia and Jupp 2000, "Directional Statistics"). Standard errors of means contain the noise of
+    the sensor only, and consider that interpolated pixels share samples.
 
     Args:
-        maps: the shot. region: within its size.
-        threshold: DoLP over which pixels count in ``dolp_share``.
+        maps: the shot.
+        region: region within its size.
+        threshold: DoLP above which pixels count in ``dolp_share``.
 
     Returns:
-        By ``Field.key``, ``pixels`` to ``aolp_concentration``; angles in degrees.
+        Values by ``Field.key``, from ``pixels`` to ``aolp_concentration``, with angles in degrees; None for a figure
+        without a pixel.
     """
     at = region.place
     reason = maps.reason[at]
@@ -194,11 +212,7 @@ def region_figures(maps: ShotMaps, region: Region, threshold: float) -> dict[str
         noise_of_s0 = math.sqrt(maps.mean_variance * variance / s0.size)
     return {
         "pixels": total,
-        "usable": counts[Reason.USABLE],
-        "noise": counts[Reason.NOISE],
-        "dark": counts[Reason.DARK],
-        "saturated": counts[Reason.SATURATED],
-        "masked": counts[Reason.MASKED],
+        **{kind.name.lower(): counts[kind] for kind in Reason},
         "usable_share": counts[Reason.USABLE] / total,
         **_distribution("s0", s0, noise_of_s0),
         **_distribution("dolp", dolp, _error_of_mean(maps, _chosen(maps.sigma_dolp[at], measured))),
@@ -209,11 +223,12 @@ def region_figures(maps: ShotMaps, region: Region, threshold: float) -> dict[str
 
 
 def _chosen(values: Floats, mask: NDArray[np.bool_]) -> Floats:
+    """Return the values of a mask, without a copy if the mask is full."""
     return values.ravel() if mask.all() else values[mask]
 
 
 def _error_of_mean(maps: ShotMaps, deviations: Floats) -> float | None:
-    """Standard error of a mean over pixels of these standard deviations, which share samples; None without any."""
+    """Return the standard error of a mean over pixels with these standard deviations; None without pixels."""
     if not deviations.size:
         return None
     shared = 1.0 if maps.mean_variance is None else maps.mean_variance / maps.pixel_variance
@@ -226,8 +241,9 @@ def _distribution(key: str, values: Floats, error: float | None) -> dict[str, Va
     if not values.size:
         return dict.fromkeys(names)
     mean, deviation = (float(moment[0, 0]) for moment in cv2.meanStdDev(values))  # one pass, in float64
-    percentiles = map(float, np.percentile(values, PERCENTILES))
-    return dict(zip(names, (mean, error, deviation, *percentiles), strict=True))
+    return dict(
+        zip(names, (mean, error, deviation, *map(float, np.percentile(values, PERCENTILES))), strict=True)
+    )
 
 
 def _angles(aolp: Floats, error: float | None) -> dict[str, Value]:
@@ -236,7 +252,7 @@ def _angles(aolp: Floats, error: float | None) -> dict[str, Value]:
     mean, length = axial_mean(aolp)
     degrees = math.degrees(mean) % 180.0
     return {
-        "aolp_mean": 0.0 if degrees == 180.0 else degrees,  # what is just below 0 is rounded to 180
+        "aolp_mean": 0.0 if degrees == 180.0 else degrees,  # % rounds tiny negative angles to 180
         "aolp_error": None if error is None else math.degrees(error),
         "aolp_deviation": math.degrees(math.sqrt(-2 * math.log(max(length, 1e-300)))) / 2,
         "aolp_concentration": length,
@@ -244,23 +260,20 @@ def _angles(aolp: Floats, error: float | None) -> dict[str, Value]:
 
 
 def axial_mean(angles: Floats) -> tuple[float, float]:
-    """Circular mean of angles modulo pi, in [-pi/2, pi/2], and the mean resultant length of the doubled ones."""
+    """Return the circular mean of angles modulo pi, in [-pi/2, pi/2], and the resultant length of doubled angles."""
     doubled = 2 * angles
     cosine = np.cos(doubled).mean(dtype=np.float64)
     sine = np.sin(doubled).mean(dtype=np.float64)
     return math.atan2(sine, cosine) / 2, min(1.0, math.hypot(cosine, sine))
 
 
-Mask = NDArray[np.bool_]
-
-
 @dataclass(frozen=True, eq=False)
 class Differences:
-    """A shot less the reference; nothing is registered: one camera, one place.
+    """Differences of a shot and the reference, which are not registered.
 
     Attributes:
-        s0, dolp: [H, W]; NaN where either has none. The DoLP is the debiased one.
-        aolp: [H, W] radians in [-pi/2, pi/2]; NaN where a pixel is not usable in both.
+        s0, dolp: [H, W]; NaN if a pixel is not measured in both. The DoLP is debiased.
+        aolp: [H, W] radians in [-pi/2, pi/2]; NaN if a pixel is not usable in both.
     """
 
     s0: Map
@@ -268,98 +281,71 @@ class Differences:
     aolp: Map
 
 
-class Reference:
-    """The golden part. Keeps the maps that are compared, and no more."""
+def subtract(maps: ShotMaps, golden: ShotMaps) -> Differences:
+    """Subtract the maps of the golden part from the maps of a shot.
 
-    def __init__(self, shot: ExposureSet, maps: ShotMaps) -> None:
-        self.shot = shot
-        self.name = maps.name
-        self.size = maps.size
-        self._s0 = maps.s0.copy()
-        self._dolp = maps.dolp_debiased
-        self._aolp = maps.aolp
-        self._measured = maps.measured
-        self._usable = maps.usable
-
-    @classmethod
-    def read(cls, path: Path, options: ShotOptions) -> Reference:
-        """Read a reference.
-
-        Args:
-            path: of a mosaic, of one of four shots through a filter (the others lie beside it), or of a folder with
-                one shot.
-            options: as for the shots that it is compared with.
-
-        Raises:
-            PolarguideError: the path is not one shot, or cannot be read.
-        """
-        shot = _reference_shot(path, options)
-        return cls(shot, read_shot(shot, options))
-
-    def differences(self, maps: ShotMaps) -> Differences:
-        """The maps of a shot less those of the reference.
-
-        Raises:
-            PolarguideError: the sizes differ.
-        """
-        if maps.size != self.size:
-            raise PolarguideError(
-                maps.files[0] if maps.files else maps.name,
-                expected=f"{self.size[0]}x{self.size[1]} pixels like the reference {self.name}",
-                found=f"{maps.size[0]}x{maps.size[1]}",
-                remedy="Take both with one camera and one region, and develop them alike.",
-            )
-        both = maps.measured & self._measured
-        angles = maps.usable & self._usable
-        turned = np.remainder(maps.aolp - self._aolp + math.pi / 2, math.pi) - math.pi / 2
-        return Differences(
-            _where(both, maps.s0 - self._s0),
-            _where(both, maps.dolp_debiased - self._dolp),
-            _where(angles, turned),
-        )
+    Raises:
+        PolarguideError: the sizes differ.
+    """
+    require(
+        maps.size == golden.size,
+        maps.files[0] if maps.files else maps.name,
+        expected=f"{golden.size[0]}x{golden.size[1]} pixels like the reference {golden.name}",
+        found=f"{maps.size[0]}x{maps.size[1]}",
+        remedy="Take both with one camera and one region, and develop them alike.",
+    )
+    reason = np.maximum(maps.reason, golden.reason)
+    angle = np.remainder(maps.aolp - golden.aolp + math.pi / 2, math.pi) - math.pi / 2
+    nan = np.float32(np.nan)
+    return Differences(
+        np.where(reason <= Reason.NOISE, maps.s0 - golden.s0, nan),
+        np.where(reason <= Reason.NOISE, maps.dolp_debiased - golden.dolp_debiased, nan),
+        np.where(reason == Reason.USABLE, angle, nan),
+    )
 
 
-def _where(mask: Mask, values: Map) -> Map:
-    return np.where(mask, values, np.float32(np.nan)).astype(np.float32, copy=False)
+def read_reference(path: Path, options: ShotOptions) -> ShotMaps:
+    """Read the maps of a golden part, without its intensities.
 
+    Args:
+        path: path of a mosaic, of one of four shots through a filter, or of a folder with one shot.
+        options: options of the shots.
 
-def _reference_shot(path: Path, options: ShotOptions) -> ExposureSet:
+    Raises:
+        PolarguideError: the path is not one shot, or cannot be read.
+    """
     if path.is_file() and options.sensor is None:
-        same = path.resolve()
-        folder = same.parent if angle_of_folder(same.parent) is None else same.parent.parent
-        beside = find_shots([folder], options)
-        found = [shot for shot in beside if any(file.resolve() == same for file in shot.paths)]
+        file = path.resolve()
+        folder = file.parent if angle_of_folder(file.parent) is None else file.parent.parent
+        shots = [shot for shot in find_shots([folder], options) if file in map(Path.resolve, shot.paths)]
     else:
-        found = find_shots([path], options)
-    if len(found) != 1:
-        raise PolarguideError(
-            "--reference",
-            expected="one shot",
-            found=f"{len(found)} in {path}",
-            remedy="Name its file; one of the four where they are four.",
-        )
-    return found[0]
+        shots = find_shots([path], options)
+    require(
+        len(shots) == 1,
+        "--reference",
+        expected="one shot",
+        found=f"{len(shots)} in {path}",
+        remedy="Name a file of the shot.",
+    )
+    maps = read_shot(shots[0], options)
+    return replace(maps, intensities=maps.intensities[:, :0].copy())
 
 
 def difference_figures(differences: Differences | None, region: Region) -> dict[str, Value]:
-    """Figures of the differences in a region, ``compared`` and the fields after it; None without a reference."""
+    """Return the figures of differences in a region, from ``compared`` on; None without a reference."""
+    figures: dict[str, Value] = dict.fromkeys(COMPARED)
     if differences is None:
-        return dict.fromkeys(COMPARED)
+        return figures
     inside = region.inside
     s0, dolp, aolp = (
         values[region.place][np.isfinite(values[region.place]) & (True if inside is None else inside)]
         for values in (differences.s0, differences.dolp, differences.aolp)
     )
-    figures: dict[str, Value] = {
-        **dict.fromkeys(COMPARED),
-        "compared": int(s0.size),
-        "compared_angles": int(aolp.size),
-    }
+    figures |= {"compared": int(s0.size), "compared_angles": int(aolp.size)}
     for key, values in (("s0", s0), ("dolp", dolp), ("aolp", np.degrees(aolp))):
         if values.size:
-            mean = (
-                math.degrees(axial_mean(aolp)[0]) if key == "aolp" else float(values.mean(dtype=np.float64))
-            )
+            axial = key == "aolp"
+            mean = math.degrees(axial_mean(aolp)[0]) if axial else float(values.mean(dtype=np.float64))
             largest = float(np.percentile(np.abs(values), DIFFERENCE_PERCENTILE))
             figures[f"{key}_difference"] = mean
             figures[f"{key}_difference_rms"] = float(np.sqrt(np.mean(values.astype(np.float64) ** 2)))

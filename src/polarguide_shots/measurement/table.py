@@ -1,28 +1,30 @@
-"""The table of a folder of shots on disk: it survives a kill at any moment without a lost or a doubled line.
+"""The table of measured shots: fields, limits files, and the files on disk.
 
-``table.jsonl`` has one line per shot, with all of its regions and the files that it was read from: it is the table
-and the journal of what is done in one, so that the two cannot disagree. A line is written in one piece and forced to
-disk before anything else happens; what a kill leaves of one is cut off at the next start, and its shot is measured
-again.
-``table.csv`` has one line per region. It is written after the other, and made anew from it at every start.
+``table.jsonl`` has one line per shot, with all regions and files. It is both the table and the journal of measured
+shots. A line is written at once and forced to disk before the next step. The next start removes an incomplete line, and
+its shot is measured again. No line is lost or repeated if the process is killed.
+``table.csv`` has one line per region. It is written after ``table.jsonl`` and recreated from it at every start.
 """
 
 from __future__ import annotations
 
 import contextlib
+import difflib
 import hashlib
 import itertools
 import json
+import math
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import Annotated, Any, BinaryIO
+from typing import Annotated, Any, BinaryIO, Literal
 
 import msgspec
 from msgspec import Meta
 
-from polarguide.core.errors import PolarguideError
+from polarguide.core.errors import PolarguideError, require
 from polarguide.core.files import (
     atomic,
     check_out,
@@ -35,19 +37,227 @@ from polarguide.core.files import (
 from polarguide.core.records import decode, first_differing_value, read_record, shortened, to_json
 from polarguide.core.system import only_writer
 from polarguide.core.text import csv_lines
-from polarguide_shots.measurement.fields import FORMAT, KEYS, Status, Value
+
+FORMAT = 2
+"""Version of the table. Any change of the name, order or meaning of fields increases it."""
+PERCENTILES = (1, 5, 50, 95, 99)
+"""Percentiles of S0 and DoLP."""
+DIFFERENCE_PERCENTILE = 99
+"""Percentile of absolute differences."""
+Value = int | float | str | None
+
+Status = Literal["measured", "within", "beyond", "unread"]
+
+
+@dataclass(frozen=True)
+class Field:
+    """A field of the table.
+
+    Attributes:
+        key: name.
+        unit: unit of the numbers; empty without a unit.
+        about: description.
+        bounded: True if a limits file may bound the field.
+    """
+
+    key: str
+    unit: str
+    about: str
+    bounded: bool = True
+
+
+def _spread(key: str, unit: str, what: str) -> tuple[Field, ...]:
+    return (
+        Field(f"{key}_mean", unit, f"mean of {what}"),
+        Field(f"{key}_error", unit, f"standard error of {key}_mean by the sensor's noise"),
+        Field(f"{key}_deviation", unit, f"standard deviation of {what}"),
+        *(Field(f"{key}_p{p}", unit, f"{p}th percentile of {what}") for p in PERCENTILES),
+    )
+
+
+def _difference(key: str, unit: str, what: str, mean: str, more: str = "") -> tuple[Field, ...]:
+    return (
+        Field(f"{key}_difference", unit, f"{mean} of the shot's {what} less that of the reference{more}"),
+        Field(f"{key}_difference_rms", unit, f"root mean square of the difference in {what}"),
+        Field(
+            f"{key}_difference_p{DIFFERENCE_PERCENTILE}",
+            unit,
+            f"{DIFFERENCE_PERCENTILE}th percentile of the absolute difference in {what}",
+        ),
+    )
+
+
+FIELDS = (
+    Field("shot", "", "name of the shot", False),
+    Field("files", "", "paths of the files, separated by semicolons", False),
+    Field("taken", "", "time of the last change of the files, UTC; empty for a shot without files", False),
+    Field("region", "", "name of the region; empty for a shot that could not be read", False),
+    Field("x", "pixels", "left column of the region", False),
+    Field("y", "pixels", "top row of the region", False),
+    Field("width", "pixels", "of the region", False),
+    Field("height", "pixels", "of the region", False),
+    Field("status", "", "measured (without a limit), within, beyond (a limit), or unread", False),
+    Field("why", "", "the exceeded limits, or the reason why the shot could not be read", False),
+    Field("pixels", "pixels", "in the region"),
+    Field("usable", "pixels", "with a valid angle"),
+    Field("noise", "pixels", "whose DoLP is not above its noise"),
+    Field("dark", "pixels", "whose light is not above the noise"),
+    Field("saturated", "pixels", "with a sample at full scale"),
+    Field("masked", "pixels", "marked as invalid, or outside of the mask"),
+    Field("usable_share", "", "usable / pixels"),
+    *_spread("s0", "full scale", "S0 (at most 2) over pixels that are usable or have the reason noise"),
+    *_spread("dolp", "", "the debiased DoLP over the same pixels"),
+    Field("dolp_threshold", "", "the option --threshold", False),
+    Field("dolp_share", "", "share of the same pixels whose debiased DoLP is over the threshold"),
+    Field("aolp_mean", "degrees", "circular mean of the AoLP over usable pixels, 0 to 180"),
+    Field("aolp_error", "degrees", "standard error of aolp_mean by the sensor's noise"),
+    Field("aolp_deviation", "degrees", "circular standard deviation of the AoLP over usable pixels"),
+    Field(
+        "aolp_concentration", "", "mean resultant length of the doubled angles: 1 all alike, 0 no direction"
+    ),
+    Field("compared", "pixels", "with S0 and DoLP in both the shot and the reference"),
+    Field("compared_angles", "pixels", "usable in both"),
+    *_difference("s0", "full scale", "S0", "mean"),
+    *_difference("dolp", "", "debiased DoLP", "mean"),
+    *_difference("aolp", "degrees", "AoLP", "circular mean", ", -90 to 90"),
+)
+"""Fields in the order of the columns. A missing value is an empty cell, in JSON null."""
+KEYS = tuple(field.key for field in FIELDS)
+"""Names of the fields."""
+BOUNDED = tuple(field.key for field in FIELDS if field.bounded)
+"""Names of the fields that a limits file may bound."""
+COMPARED = KEYS[KEYS.index("compared") :]
+"""Names of the fields that need a reference."""
+AXIAL = ("aolp_mean",)
+"""Names of the fields with a period of 180 degrees."""
+_REMEDY = "Correct the file."
+
+
+class Bound(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
+    """Smallest and largest allowed value; None: no bound."""
+
+    min: float | None = None
+    max: float | None = None
+
+
+class Limits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Content of a limits file.
+
+    Attributes:
+        format: version of the file, 1.
+        limits: bounds by field, for all regions.
+        regions: bounds by region and field, which replace those in ``limits``.
+    """
+
+    format: int = 1
+    limits: dict[str, Bound] = {}
+    regions: dict[str, dict[str, Bound]] = {}
+
+    def of(self, region: str) -> dict[str, Bound]:
+        """Return the bounds of a region, by field."""
+        return {**self.limits, **self.regions.get(region, {})}
+
+
+NO_LIMITS = Limits()
+"""Limits without a bound."""
+
+
+def read_limits(path: Path, regions: Collection[str], *, reference: bool) -> Limits:
+    """Read a limits file.
+
+    Args:
+        path: JSON file ``{"limits": {field: {"min": a, "max": b}}, "regions": {region: {field: ...}}}``.
+        regions: names of the regions.
+        reference: True if shots are compared with a reference.
+
+    Raises:
+        PolarguideError: the file cannot be read, a field or region is unknown, or the file has no bound.
+    """
+    limits = read_record(path, Limits, remedy=_REMEDY)
+    _require(limits.format == 1, f"{path} (format)", "1", str(limits.format))
+    places = {"limits": limits.limits}
+    for region, bounds in limits.regions.items():
+        _require(region in regions, f"{path} (regions)", f"a region of --roi: {', '.join(regions)}", region)
+        places[f"regions.{region}"] = bounds
+    for place, bounds in places.items():
+        for field, bound in bounds.items():
+            _check(f"{path} ({place}.{field})", field, bound, reference)
+    _require(any(places.values()), f"{path} (limits)", "a bound of at least one field", "none")
+    return limits
+
+
+def _check(where: str, field: str, bound: Bound, reference: bool) -> None:
+    """Validate the bound of a field.
+
+    Raises:
+        PolarguideError: the field is unknown or needs a reference, or the bound is invalid.
+    """
+    near = " or ".join(difflib.get_close_matches(field, BOUNDED, 3, 0.5))
+    hint = f"Did you mean {near}?" if near else _REMEDY
+    _require(field in BOUNDED, where, "a field of the table", field, hint)
+    _require(
+        reference or field not in COMPARED,
+        where,
+        "a golden part, because this field limits the difference from it",
+        "none",
+        "Give the golden part with --reference, or remove the field.",
+    )
+    numbers = [value for value in (bound.min, bound.max) if value is not None]
+    found = " and ".join(f"{value:g}" for value in numbers) or "neither"
+    _require(numbers, where, "min, max or both", found)
+    if field in AXIAL:
+        _require(all(0 <= value <= 180 for value in numbers), where, "angles from 0 to 180", found)
+    else:
+        _require(numbers[0] <= numbers[-1], where, "a min up to the max", found)
+
+
+def _require(condition: object, where: str, expected: str, found: str, remedy: str = _REMEDY) -> None:
+    require(condition, where, expected=expected, found=found, remedy=remedy)
+
+
+def faults(figures: Mapping[str, Value], bounds: Mapping[str, Bound]) -> list[str]:
+    """Describe the figures that are beyond their bounds. A missing value is beyond a bound."""
+    beyond = []
+    for field, bound in bounds.items():
+        value = figures[field]
+        low = -math.inf if bound.min is None else bound.min
+        high = math.inf if bound.max is None else bound.max
+        if not isinstance(value, int | float):
+            beyond.append(f"{field} has no value")
+        elif low > high:  # the allowed angles contain 180
+            if high < value < low:
+                beyond.append(f"{field} {value:.5g} outside {low:g} through 180 to {high:g}")
+        elif not low <= value <= high:
+            limit = f"under {low:g}" if value < low else f"over {high:g}"
+            beyond.append(f"{field} {value:.5g} {limit}")
+    return beyond
+
+
+def verdict(beyond: Sequence[str], bounds: Mapping[str, Bound]) -> dict[str, Value]:
+    """Return the status of a region, and the exceeded limits."""
+    return {
+        "status": "beyond" if beyond else "within" if bounds else "measured",
+        "why": ", ".join(beyond),
+    }
+
+
+def worst(regions: Sequence[Mapping[str, Value]]) -> Status:
+    """Return the worst status of regions."""
+    statuses = [figures["status"] for figures in regions]
+    return "beyond" if "beyond" in statuses else "within" if "within" in statuses else "measured"
+
 
 LINES = "table.jsonl"
 CSV = "table.csv"
 SETTINGS = "measure.json"
 LOCK = ".lock"
 _LAST = 2**63 - 1
-"""Of the nanoseconds that a time may lie from 1970, 292 years; some disks have later ones."""
-_ANEW = "Give another --out, or --overwrite to begin this table anew."
+"""Largest time in nanoseconds since 1970, 292 years. Some disks have later times."""
+_REPLACE = "Give another --out, or --overwrite to replace this table."
 
 
 class FileStamp(msgspec.Struct, frozen=True):
-    """A file as it was read: path, size in bytes, and time of its last change in nanoseconds."""
+    """State of a file: path, size in bytes, and time of its last change in nanoseconds."""
 
     path: str
     bytes: int
@@ -55,14 +265,14 @@ class FileStamp(msgspec.Struct, frozen=True):
 
 
 def stamps(paths: Sequence[Path]) -> tuple[FileStamp, ...]:
-    """The present state of files.
+    """Return the current state of files.
 
     Raises:
-        OSError: one is not there.
+        OSError: a file is missing.
     """
-    about = ((os.path.abspath(path), os.stat(path)) for path in paths)
+    states = ((os.path.abspath(path), os.stat(path)) for path in paths)
     return tuple(
-        FileStamp(path, state.st_size, min(max(state.st_mtime_ns, -_LAST), _LAST)) for path, state in about
+        FileStamp(path, state.st_size, min(max(state.st_mtime_ns, -_LAST), _LAST)) for path, state in states
     )
 
 
@@ -70,14 +280,14 @@ class Entry(msgspec.Struct, frozen=True):
     """One line of ``table.jsonl``.
 
     Attributes:
-        format: ``fields.FORMAT``.
-        shot: its name.
-        files: it was read from.
-        status: the worst of its regions; unread where it could not be read.
-        why: then, the reason.
-        notes: what was assumed about it.
-        regions: by ``Field.key``, from ``region`` on.
-        picture: name of its pictures without suffix, "" where none was drawn.
+        format: ``FORMAT``.
+        shot: name of the shot.
+        files: files of the shot.
+        status: worst status of the regions; "unread" for a shot that could not be read.
+        why: reason of an unread shot, else empty.
+        notes: assumptions about the shot.
+        regions: figures of the regions by ``Field.key``, from ``region`` on.
+        picture: name of the pictures without suffix; empty without pictures.
     """
 
     format: int
@@ -90,25 +300,38 @@ class Entry(msgspec.Struct, frozen=True):
     picture: str = ""
 
     def line(self) -> bytes:
-        """The line of ``table.jsonl``; JSON's escapes keep names that are no Unicode."""
+        """Return the line of ``table.jsonl``. Escapes of JSON keep names that are not valid Unicode."""
         return json.dumps(msgspec.to_builtins(self)).encode() + b"\n"
 
     def rows(self) -> Iterator[list[Value]]:
-        """The lines of the CSV table."""
-        shared: dict[str, Value] = {
-            "shot": self.shot,
-            "files": ";".join(file.path for file in self.files),
-            "taken": "",
-        }
+        """Return the lines of the CSV table."""
+        taken = ""
         if self.files:
             newest = datetime.fromtimestamp(max(file.modified for file in self.files) / 1e9, timezone.utc)
-            shared["taken"] = newest.isoformat(timespec="milliseconds").replace("+00:00", "Z")
+            taken = newest.isoformat(timespec="milliseconds").replace("+00:00", "Z")
+        files = ";".join(file.path for file in self.files)
         for figures in self.regions or ({"status": self.status, "why": self.why},):
-            yield [{**shared, **figures}.get(key) for key in KEYS]
+            row: dict[str, Value] = {"shot": self.shot, "files": files, "taken": taken, **figures}
+            yield [row.get(key) for key in KEYS]
 
 
 class Table(contextlib.AbstractContextManager["Table"]):
-    """A table that is open for more lines. Close it, or use it as a context."""
+    """An open table. The context manager closes it.
+
+    Args:
+        folder: folder to create.
+        settings: all settings that the figures depend on, which are equal for all shots of a table.
+        overwrite: replace a table with other settings. A table without a measured shot is always replaced.
+        judge: function that compares a line with the limits of the settings, for a table with other limits.
+
+    Attributes:
+        judged_again: number of lines that were compared with new limits.
+        close: release the table for other processes.
+
+    Raises:
+        PolarguideError: another process writes the table, it has other settings, it is damaged before its end, or it
+            cannot be written.
+    """
 
     def __init__(
         self,
@@ -116,24 +339,12 @@ class Table(contextlib.AbstractContextManager["Table"]):
         settings: Mapping[str, Any],
         *,
         overwrite: bool = False,
-        judged: Callable[[Entry], Entry] | None = None,
+        judge: Callable[[Entry], Entry] | None = None,
     ) -> None:
-        """Open the table of a folder, or begin one.
-
-        Args:
-            folder: is made. settings: all that the figures depend on; a table has the same for all of its shots.
-            judged: a line by the limits of the settings, where the table was made with other limits alone.
-            overwrite: begin anew where it was made with others; so is a table without a single measured shot.
-
-        Raises:
-            PolarguideError: another process writes it, it was made with other settings, it is damaged (but for its
-                end), or it cannot be written.
-        """
         check_out(folder)
         make_folder(folder)
         self.folder = folder
         self.judged_again = 0
-        """Lines that were judged by other limits than before."""
         self._done: dict[bytes, Entry] = {}
         self._pictures: set[str] = set()
         self._files: list[BinaryIO] = []
@@ -141,155 +352,161 @@ class Table(contextlib.AbstractContextManager["Table"]):
             stack.enter_context(
                 only_writer(
                     folder / LOCK,
-                    expected="a table that nobody else writes",
+                    expected="a table without another writer",
                     found="another polarguide measure at work on it",
                 )
             )
-            self._begin({"format": FORMAT, **settings}, overwrite, judged)
+            self._open({"format": FORMAT, **settings}, overwrite, judge)
             for name in (LINES, CSV):
                 with writing(folder / name):
                     self._files.append(stack.enter_context(open(folder / name, "ab", buffering=0)))
             self.close = stack.pop_all().close
-            """Let others write the table."""
 
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def status_of(self, files: tuple[FileStamp, ...]) -> Status | None:
-        """The status in the line of these files as they are, None where there is no such line."""
-        entry = self.entry_of(files)
-        return None if entry is None else entry.status
-
     def entry_of(self, files: tuple[FileStamp, ...]) -> Entry | None:
-        """The line of these files as they are, with figures where it is beyond; None where there is no such line."""
+        """Return the line of files in their current state, or None. Only a line beyond its limits has figures."""
         return self._done.get(_key(files))
 
     def picture_name(self, shot: str) -> str:
-        """A name for the pictures of a shot that those of no other have, upper and lower case taken alike."""
+        """Return a new name for the pictures of a shot, unique without regard to case."""
         names = itertools.chain((shot,), (f"{shot}-{number}" for number in itertools.count(2)))
         return next(name for name in names if name.casefold() not in self._pictures)
 
-    def add(self, entry: Entry) -> None:
-        """Write the lines of a shot; when this returns, they are on disk.
+    def add(self, entry: Entry) -> Entry:
+        """Write the lines of a shot, force them to disk, and return the entry.
 
         Raises:
             PolarguideError: the lines cannot be written, as on a full disk, or the table was removed.
         """
-        self.require_there()
+        self.require_present()
         lines, rows = self._files
         _append(self.folder / LINES, lines, entry.line())
-        self._note(entry)
+        self._record(entry)
         _append(self.folder / CSV, rows, _csv(entry.rows()))
+        return entry
 
-    def require_there(self) -> None:
-        """Check that the files are still those that are written to: what is removed meanwhile takes lines silently.
+    def require_present(self) -> None:
+        """Check that the open files still exist under their names. A removed file would lose lines silently.
 
         Raises:
-            PolarguideError: one was removed, renamed or replaced.
+            PolarguideError: a file was removed, renamed or replaced.
         """
         for name, file in zip((LINES, CSV), self._files, strict=True):
             path = self.folder / name
-            try:
-                there = os.path.samestat(os.fstat(file.fileno()), os.stat(path))
-            except OSError:
-                there = False
-            if not there:
-                raise PolarguideError(
-                    path,
-                    expected="the table that was opened",
-                    found="that it was removed, renamed or replaced meanwhile",
-                    remedy="Put it back if you can; the same command measures what is not in it.",
-                )
+            present = False
+            with contextlib.suppress(OSError):
+                present = os.path.samestat(os.fstat(file.fileno()), os.stat(path))
+            require(
+                present,
+                path,
+                expected="the table that was opened",
+                found="a removed, renamed or replaced file",
+                remedy="Restore it if possible; the same command measures the missing shots.",
+            )
 
-    def _note(self, entry: Entry) -> None:
+    def _record(self, entry: Entry) -> None:
+        """Keep a line in memory, with figures if it is beyond its limits."""
         short = entry if entry.status == "beyond" else msgspec.structs.replace(entry, regions=(), notes=())
         self._done[_key(entry.files)] = short
         if entry.picture:
             self._pictures.add(entry.picture.casefold())
 
-    def _begin(
-        self, settings: dict[str, Any], overwrite: bool, judged: Callable[[Entry], Entry] | None
+    def _open(
+        self, settings: dict[str, Any], overwrite: bool, judge: Callable[[Entry], Entry] | None
     ) -> None:
-        """Make what there is whole again, or begin anew."""
+        """Repair an existing table, or create a new one.
+
+        Raises:
+            PolarguideError: the table has other settings, is damaged, or cannot be written.
+        """
         path = self.folder / SETTINGS
         lines = self.folder / LINES
         for place in (path, lines):
-            if os.path.lexists(place):  # somebody else may have made the folder
+            if os.path.lexists(place):  # the folder may come from another user
                 require_inside(self.folder, place)
-                require_file(place, expected="a file of a table", remedy=_ANEW)
+                require_file(place, expected="a file of a table", remedy=_REPLACE)
         if path.exists() and lines.exists():
-            before = read_record(path, dict[str, Any], remedy=_ANEW) if not overwrite else None
+            before = read_record(path, dict[str, Any], remedy=_REPLACE) if not overwrite else None
             now: dict[str, Any] = json.loads(to_json(settings))
+            without_limits = {**now, "limits": None}
             if before == now:
-                self._mend()
+                self._repair()
                 return
-            if (
-                judged is not None
-                and before is not None
-                and {**before, "limits": None} == {**now, "limits": None}
-            ):
-                write_whole(path, to_json({**now, "limits": None}))  # until all lines are by the same
-                self._mend()
-                self._judge(judged)
+            if judge is not None and before is not None and {**before, "limits": None} == without_limits:
+                # Settings without limits mark a table whose lines are compared with new limits.
+                write_whole(path, to_json(without_limits))
+                self._repair()
+                self._judge(judge)
                 write_whole(path, to_json(settings))
-                self._done.clear()
-                self._pictures.clear()
-                self._mend()
+                self._repair()
                 return
-            if before is not None and _holds_measurements(lines):
-                name, was, is_now = first_differing_value("", before, now)
+            if before is not None and _has_measurements(lines):
+                name, was, requested = first_differing_value("", before, now)
                 raise PolarguideError(
                     f"{path} ({name[1:]})",
                     expected=shortened(was, 200),
-                    found=shortened(is_now, 200),
-                    remedy=f"One table has one set of options. {_ANEW}",
+                    found=shortened(requested, 200),
+                    remedy=f"One table has one set of options. {_REPLACE}",
                 )
-        elif lines.exists() and not overwrite:
-            raise PolarguideError(
-                path, expected="the options that this table was made with", found="nothing", remedy=_ANEW
+        elif not overwrite:
+            require(
+                not lines.exists(),
+                path,
+                expected="the options of this table",
+                found="no file",
+                remedy=_REPLACE,
             )
-        elif os.path.lexists(self.folder / CSV) and not overwrite:
-            raise PolarguideError(
+            require(
+                not os.path.lexists(self.folder / CSV),
                 self.folder / CSV,
-                expected=f"a new table, or one with {LINES} beside it",
-                found="a file of this name alone",
-                remedy=_ANEW,
+                expected=f"a new table, or a table with {LINES}",
+                found="a file of this name only",
+                remedy=_REPLACE,
             )
         write_whole(lines, b"")
         write_whole(path, to_json(settings))
-        self._mend()
+        self._repair()
 
-    def _mend(self) -> None:
-        """Cut off a torn last line, note what is done, and make the CSV table anew."""
+    def _repair(self) -> None:
+        """Read all lines, remove an incomplete last line, and recreate the CSV table.
+
+        Raises:
+            PolarguideError: a line is invalid, or a file cannot be written.
+        """
         path = self.folder / LINES
-        whole = 0
+        self._done.clear()
+        self._pictures.clear()
+        complete = 0
         with atomic(self.folder / CSV) as temporary, open(temporary, "wb") as rows, open(path, "rb") as lines:
             rows.write(_csv([list(KEYS)]))
             for number, line in enumerate(lines, 1):
                 if not line.endswith(b"\n"):
                     break
-                entry = decode(line, Entry, f"{path} (line {number})", remedy=_ANEW)
-                if entry.format != FORMAT:
-                    raise PolarguideError(
-                        f"{path} (line {number}, format)",
-                        expected=str(FORMAT),
-                        found=str(entry.format),
-                        remedy=_ANEW,
-                    )
-                self._note(entry)
+                entry = decode(line, Entry, f"{path} (line {number})", remedy=_REPLACE)
+                place = f"{path} (line {number}, format)"
+                require(
+                    entry.format == FORMAT,
+                    place,
+                    expected=str(FORMAT),
+                    found=str(entry.format),
+                    remedy=_REPLACE,
+                )
+                self._record(entry)
                 rows.write(_csv(entry.rows()))
-                whole += len(line)
-        if whole < path.stat().st_size:
+                complete += len(line)
+        if complete < path.stat().st_size:
             with writing(path), open(path, "r+b") as file:
-                file.truncate(whole)
+                file.truncate(complete)
                 os.fsync(file.fileno())
 
-    def _judge(self, judged: Callable[[Entry], Entry]) -> None:
-        """Write all lines anew, as other limits judge them."""
+    def _judge(self, judge: Callable[[Entry], Entry]) -> None:
+        """Compare all lines with new limits, and replace them."""
         path = self.folder / LINES
         with atomic(path) as temporary, open(temporary, "wb") as new, open(path, "rb") as lines:
             for number, line in enumerate(lines, 1):
-                entry = judged(decode(line, Entry, f"{path} (line {number})", remedy=_ANEW))
+                entry = judge(decode(line, Entry, f"{path} (line {number})", remedy=_REPLACE))
                 if entry.status == "beyond" and not entry.picture:
                     entry = msgspec.structs.replace(entry, picture=self.picture_name(entry.shot))
                     self._pictures.add(entry.picture.casefold())
@@ -298,7 +515,7 @@ class Table(contextlib.AbstractContextManager["Table"]):
 
 
 def _append(path: Path, file: BinaryIO, data: bytes) -> None:
-    """Write at the end of a file and force it to disk: all of it, or nothing."""
+    """Append data to a file completely or not at all, and force it to disk."""
     with writing(path):
         size = os.fstat(file.fileno()).st_size
         try:
@@ -312,7 +529,7 @@ def _append(path: Path, file: BinaryIO, data: bytes) -> None:
             raise
 
 
-def _csv(rows: Any) -> bytes:
+def _csv(rows: Iterable[Iterable[object]]) -> bytes:
     return csv_lines(rows).encode("utf-8", "backslashreplace")
 
 
@@ -320,6 +537,6 @@ def _key(files: tuple[FileStamp, ...]) -> bytes:
     return hashlib.sha256(json.dumps(msgspec.to_builtins(files)).encode()).digest()[:16]
 
 
-def _holds_measurements(path: Path) -> bool:
+def _has_measurements(path: Path) -> bool:
     with open(path, "rb") as lines:
         return any(b'"status": "unread"' not in line for line in lines)

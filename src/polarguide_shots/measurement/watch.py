@@ -1,12 +1,13 @@
-"""Watch a folder: measure shots as their files come, each once, and none that is half written."""
+"""Measurement of the shots of a watched folder, each once, as soon as its files are complete."""
 
 from __future__ import annotations
 
+import contextlib
 import os
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 from polarguide.capture.formats.headers import find_damage
@@ -25,76 +26,85 @@ from polarguide_shots.read import UNREADABLE
 from polarguide_shots.sets import ExposureSet
 
 _POLL = (0.05, 0.5)
-"""Seconds between two looks, at least and at most, unless a look takes long itself."""
+"""Smallest and largest interval of searches in seconds. A slow search increases it."""
 
 
 @dataclass
-class _Coming:
+class _Pending:
     """A shot that is not in the table.
 
     Attributes:
-        files: as they were when last looked at. since: when they became so.
-        doubtful: reading them failed in a way that more bytes may fix. reported: that it is incomplete.
+        files: state of the files at the last search.
+        since: time of their last change.
+        truncated: reading failed because a file may be incomplete.
+        reported: a warning on missing files was given.
     """
 
     files: tuple[FileStamp, ...]
     since: float
-    doubtful: bool = False
+    truncated: bool = False
     reported: bool = False
 
 
 @dataclass
 class _Folder:
-    """The contents of a watched folder."""
+    """Search of a watched folder.
+
+    Attributes:
+        root: the folder.
+        reading: options of reading.
+        reporter: receiver of warnings.
+        ignored: real paths of files that are not shots.
+        patience: seconds after which an error is reported.
+    """
 
     root: Path
     reading: ShotOptions
     reporter: Reporter
     ignored: frozenset[str]
     patience: float
-    _trouble: tuple[str, float] = field(default=("", 0.0))
-    _said: str = ""
+    _error: tuple[str, float] = ("", 0.0)
+    _reported: str = ""
 
     def shots(self) -> list[ExposureSet]:
-        """The shots that are there, the oldest first; of those of several files, parts, too."""
+        """Return all shots in the folder, including incomplete shots."""
+        # An error may be temporary: the first of four folders, or a network that is down.
         try:
-            shots = (
-                self._mosaics() if self.reading.sensor is not None else list_shots([self.root], self.reading)
-            )
-        except PolarguideError as error:  # perhaps only the first of four folders is there: this may pass
-            self._worry(str(error))
-            return []
-        except OSError as error:  # the network may be gone for a while
-            self._worry(
-                f"{self.root}: expected a folder that can be read, found {error.strerror or error}. Bring it back, or "
-                "watch another."
-            )
-            return []
-        self._trouble = ("", 0.0)
+            shots = self._search()
+            self._error = ("", 0.0)
+        except (PolarguideError, OSError) as error:
+            shots = []
+            self._keep(error)
         return [shot for shot in shots if not any(os.path.realpath(p) in self.ignored for p in shot.paths)]
 
-    def _mosaics(self) -> list[ExposureSet]:
+    def _search(self) -> list[ExposureSet]:
+        if self.reading.sensor is None:
+            return list_shots([self.root], self.reading)
         files = sorted(path for path in self.root.iterdir() if path.suffix.lower() in RAW_SUFFIXES)
         return mosaics([path for path in files if not path.name.startswith(".") and path.is_file()])
 
     def trouble(self) -> str:
-        """Why nothing can be found in the folder, where that is so and there is something in it."""
-        return self._trouble[0] if self._trouble[0] and self._not_empty() else ""
+        """Return the reason why no shot was found in a folder that is not empty; else an empty string."""
+        return self._error[0] if self._error[0] and self._has_files() else ""
 
-    def _worry(self, text: str) -> None:
-        """Warn of what does not pass, once."""
+    def _keep(self, error: PolarguideError | OSError) -> None:
+        """Record an error, and report it once after the patience."""
+        text = str(error)
+        if isinstance(error, OSError):
+            found = error.strerror or text
+            text = f"{self.root}: expected a readable folder, found {found}. Restore it, or watch another folder."
         now = time.monotonic()
-        if text != self._trouble[0]:
-            self._trouble = (text, now)
-        elif now - self._trouble[1] >= self.patience and text != self._said and self._not_empty():
-            self._said = text
+        if text != self._error[0]:
+            self._error = (text, now)
+        elif now - self._error[1] >= self.patience and text != self._reported and self._has_files():
+            self._reported = text
             self.reporter.warn(text)
 
-    def _not_empty(self) -> bool:
-        try:
+    def _has_files(self) -> bool:
+        """Return True unless the folder is readable and empty."""
+        with contextlib.suppress(OSError):
             return any(not path.name.startswith(".") for path in self.root.iterdir())
-        except OSError:
-            return True
+        return True
 
 
 def watch_folder(
@@ -108,25 +118,31 @@ def watch_folder(
     heard: Heard = ignore,
     reporter: Reporter = SILENT,
 ) -> Outcome:
-    """Measure the shots of a folder as they come, until ``should_stop``.
+    """Measure the shots of a folder as they arrive, until ``should_stop`` returns True.
 
-    A shot is measured when none of its files has changed for ``settle`` seconds and all are whole. One that cannot be
-    read is tried again as long as its format says that it is not whole; after ``patience`` seconds without a change it
-    gets a line that says why, and so does what is ambiguous or has no angle in its name. A shot of fewer than four
-    files is waited for: after ``patience`` seconds a warning says so, and it is among those ``waiting`` at the end. A
-    set at other angles is measured when its angles are evenly spaced over half a turn or all files of ``angles.csv``
-    are there, any other after ``patience`` seconds without a change. A file that is written anew is another shot. The
-    table is the memory: the same call after a stop or a kill goes on with what is not in it.
+    A shot is measured when none of its files has changed for ``settle`` seconds and all are complete. An incomplete
+    file is retried. After ``patience`` seconds without a change, the table gets a line with the error of the shot, also
+    for an ambiguous file or a file without an angle in its name.
+
+    A shot with fewer than four files waits. A warning follows after ``patience`` seconds, and the shot is in
+    ``Outcome.waiting`` at the end. A set at other angles is measured when its angles are evenly spaced over half a turn
+    or all files of ``angles.csv`` exist. Other sets are measured after ``patience`` seconds without a change.
+
+    A rewritten file is a new shot. The same call after a stop or a kill resumes with the shots that are not in the
+    table.
 
     Args:
-        folder: of mosaics, or of shots through a filter, as ``shots.exposures.find_shots`` takes it.
+        folder: folder of mosaics or of shots through a filter (see ``find_shots``).
         out: folder of the table.
-        options, reading, watching: what is measured, how shots are read, how long is waited.
-        should_stop: is asked between two shots and several times a second.
-        heard: is called with each shot when its line is on disk. reporter: takes messages.
+        options: quantities to measure, and their limits.
+        reading: options of reading.
+        watching: intervals.
+        should_stop: callback between two shots and several times per second.
+        heard: callback for each shot after its line is on disk.
+        reporter: receiver of messages.
 
     Raises:
-        PolarguideError: there is no such folder, an option is wrong, or the table cannot be written.
+        PolarguideError: the folder is missing, an option is invalid, or the table cannot be written.
     """
     root = Path(folder)
     require_folder(root, expected="a folder to watch", remedy="Check --watch.")
@@ -135,110 +151,108 @@ def watch_folder(
     counts: Counter[str] = Counter()
     with Line(Path(out), options, reading) as line:
         ignored = [*line.measurer.reference_files, *([reading.dark_frame] if reading.dark_frame else [])]
-        there = _Folder(root, reading, reporter, frozenset(map(os.path.realpath, ignored)), watching.patience)
+        search = _Folder(
+            root, reading, reporter, frozenset(map(os.path.realpath, ignored)), watching.patience
+        )
         watch = _Watch(line, watching, reporter)
         step = min(max(watching.settle / 2, _POLL[0]), _POLL[1])
         while not (should_stop() or watch.idle()):
             begin = time.monotonic()
-            shots = there.shots()
-            took = time.monotonic() - begin
-            line.table.require_there()
-            for entry in watch.look(shots):
+            shots = search.shots()
+            duration = time.monotonic() - begin
+            line.table.require_present()
+            for entry in watch.measure(shots):
                 heard(entry)
                 counts[entry.status] += 1
                 if should_stop():
                     break
-            time.sleep(max(step, 4 * took))
-        line.table.require_there()
-        return Outcome(Path(out), counts, 0, watch.waiting(), there.trouble())
+            time.sleep(max(step, 4 * duration))
+        line.table.require_present()
+        return Outcome(Path(out), counts, 0, tuple(sorted(watch.pending)), search.trouble())
 
 
 class _Watch:
-    """Which shots of a folder are to be measured now."""
+    """State of the shots of a watched folder.
+
+    Attributes:
+        pending: shots that are not in the table, by name.
+    """
 
     def __init__(self, line: Line, options: WatchOptions, reporter: Reporter) -> None:
         self._line = line
         self._options = options
         self._reporter = reporter
-        self._coming: dict[str, _Coming] = {}
-        self._news = time.monotonic()
+        self.pending: dict[str, _Pending] = {}
+        self._changed = time.monotonic()
 
-    def look(self, shots: Sequence[ExposureSet]) -> Iterator[Entry]:
-        """Measure what is ready of the shots that are there; gives each when its line is on disk."""
-        coming: dict[str, _Coming] = {}
+    def measure(self, shots: Sequence[ExposureSet]) -> Iterator[Entry]:
+        """Measure the complete shots, the oldest first, and return each line after it is on disk."""
+        pending: dict[str, _Pending] = {}
         ready = []
         for shot in shots:
             try:
                 files = stamps(shot.paths)
-            except OSError:  # gone again
+            except OSError:  # removed since the search
                 continue
-            if self._line.table.status_of(files) is not None:
+            if self._line.table.entry_of(files) is not None:
                 continue
-            before = self._coming.get(shot.name)
-            if before is None or before.files != files:
-                self._news = time.monotonic()
-                before = _Coming(files, self._news)
-            coming[shot.name] = before
-            if self._is_ready(shot, before):
-                ready.append((max(file.modified for file in files), shot, before))
-        self._coming = coming
-        for _, shot, state in sorted(ready, key=lambda item: (item[0], item[1].name)):
-            entry = self._measure(shot, state)
+            state = self.pending.get(shot.name)
+            if state is None or state.files != files:
+                self._changed = time.monotonic()
+                state = _Pending(files, self._changed)
+            pending[shot.name] = state
+            if self._is_ready(shot, state):
+                ready.append((max(file.modified for file in files), shot.name, shot))
+        self.pending = pending
+        for _, name, shot in sorted(ready, key=lambda item: item[:2]):
+            entry = self._measure(shot, pending[name])
             if entry is not None:
-                self._news = time.monotonic()
-                del coming[shot.name]
+                self._changed = time.monotonic()
+                del pending[name]
                 yield entry
 
-    def _is_ready(self, shot: ExposureSet, state: _Coming) -> bool:
+    def _is_ready(self, shot: ExposureSet, state: _Pending) -> bool:
+        """Return True if a shot is to be measured now."""
         age = time.monotonic() - state.since
+        late = age >= self._options.patience
+        missing = [str(angle) for angle in ANGLES if angle not in shot.files]
         if age < self._options.settle:
             return False
-        late = age >= self._options.patience
-        if shot.fault is not None:  # names may still change, and a file that is too many may go
+        if shot.fault is not None:  # a later file or name may resolve it
             return late
-        if shot.kind == "set" and not late and not shot.complete:  # more angles may come
-            return False
-        if shot.kind == "filter" and len(shot.files) < len(ANGLES):
-            if late and not state.reported:
-                state.reported = True
-                missing = [str(angle) for angle in ANGLES if angle not in shot.files]
-                self._reporter.warn(
-                    f"{shot.name}: still no picture at {' and '.join(missing)} degrees; it waits."
-                )
-            return False
-        return late or not state.doubtful
+        if shot.kind == "set" and not shot.complete:
+            return late
+        if shot.kind != "filter" or not missing:
+            return late or not state.truncated
+        if late and not state.reported:
+            state.reported = True
+            self._reporter.warn(
+                f"{shot.name}: still no picture at {' and '.join(missing)} degrees; it waits."
+            )
+        return False
 
-    def _measure(self, shot: ExposureSet, state: _Coming) -> Entry | None:
+    def _measure(self, shot: ExposureSet, state: _Pending) -> Entry | None:
+        """Measure a shot, or write a line with its error; None if it has changed or may be incomplete."""
         try:
-            if stamps(shot.paths) != state.files:
-                return None
-            return self._line.measure(shot, state.files)
+            return self._line.measure(shot, state.files) if stamps(shot.paths) == state.files else None
         except ChangedWhileRead:
             return None
         except UNREADABLE as error:
             late = time.monotonic() - state.since >= self._options.patience
             try:
                 changed = stamps(shot.paths) != state.files
-                state.doubtful = not changed and not late and not all(map(_is_whole, shot.paths))
+                state.truncated = not changed and not late and not all(map(_is_complete, shot.paths))
             except OSError:
                 return None
-            return None if changed or state.doubtful else self._line.unread(shot, state.files, error)
+            return None if changed or state.truncated else self._line.unread(shot, state.files, error)
 
     def idle(self) -> bool:
-        """Whether nothing has come for as long as the options say, and nothing is being waited for to settle."""
-        quiet = time.monotonic() - self._news
+        """Return True after the time to stop without a change, unless a file may still settle."""
+        quiet = time.monotonic() - self._changed
         return 0 < self._options.idle <= quiet and quiet > self._options.settle + 2 * _POLL[1]
 
-    def waiting(self) -> tuple[str, ...]:
-        """Shots that are there and not in the table."""
-        return tuple(sorted(self._coming))
 
-
-def _is_whole(path: Path) -> bool:
-    """Whether a picture's structure is complete; of files that are no PNG, JPEG or TIFF nobody can say.
-
-    A table is taken as it is: what is wrong with it is a fault of its shot.
-    """
-    if path.suffix.lower() == ".csv":
-        return True
-    return path.suffix.lower() in SUFFIXES and find_damage(path.read_bytes()) is None
+def _is_complete(path: Path) -> bool:
+    """Return True for a table, or a complete PNG, JPEG or TIFF; False if the format does not show its end."""
+    suffix = path.suffix.lower()
+    return suffix == ".csv" or (suffix in SUFFIXES and find_damage(path.read_bytes()) is None)

@@ -45,7 +45,7 @@ CPU = torch.device("cpu")
 
 @pytest.fixture(scope="module")
 def ball() -> Scene:
-    """A small one, its light polarized."""
+    """Return a small ball in polarized light."""
     return textured_ball(views=6, width=20, height=16, tests=1, radius=1.2, polarized=0.5)
 
 
@@ -69,7 +69,7 @@ def normal_error(model: FieldModel, scene: Scene) -> float:
 
 @pytest.mark.slow
 def test_it_finds_a_ball_beside_the_middle_and_smaller_than_it_starts() -> None:
-    """The test-sized version: no grid of 128 cells, and half the rays. (3,600 steps find it more exactly.)"""
+    """Without the grid of 128 cells and with half the rays. 3,600 steps are more accurate."""
     recipe = replace(
         RECIPE_GNERP,
         shape=replace(RECIPE_GNERP.shape, resolutions=(16, 32, 64), background=(16, 32)),
@@ -178,7 +178,7 @@ READING = SceneOptions(downscale=8)
 
 
 def field_trained(scene: Path, out: Path, steps: int | None = 6, **options: Any) -> FieldRun:
-    """A run of the small recipe on a folder, on one thread."""
+    """Train the small recipe on a scene folder with one thread."""
     settings = TrainSettings(steps=steps, **options.pop("settings", {}))
     session = SessionOptions(threads=1, device="cpu")
     return train_field(
@@ -243,7 +243,7 @@ def test_steps_are_the_recipes_where_nobody_says_how_many(demo_scene: Path, tmp_
     assert run.steps == 3
     assert trained_steps(tmp_path / "run") == 3
     with safe_open(tmp_path / "run" / CHECKPOINT, framework="pt") as file:
-        assert not any(name.startswith("adam.") for name in file.keys()), "as of other runs"  # noqa: SIM118
+        assert not any(name.startswith("adam.") for name in file.keys()), "finished runs have no moments"  # noqa: SIM118
 
 
 def test_a_field_is_planned_for_by_its_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -343,7 +343,7 @@ def test_slopes_of_length_one_cost_nothing() -> None:
 
 
 def doubled(vector: torch.Tensor) -> torch.Tensor:
-    """A vector with twice its angle, by trigonometry."""
+    """Double the angle of a vector by trigonometry."""
     angle = 2 * math.atan2(float(vector[1]), float(vector[0]))
     return float(vector.norm()) * torch.tensor([math.cos(angle), math.sin(angle)]).double()
 

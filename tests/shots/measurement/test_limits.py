@@ -11,9 +11,9 @@ from faults import Fault
 
 from polarguide.visualization.figures import LINE_HEIGHT
 from polarguide_shots.maps import NoiseModel, Reason, ShotMaps
-from polarguide_shots.measurement.fields import Bound, Limits, faults, read_limits
 from polarguide_shots.measurement.pictures import _layers, _pixels_beyond, regions_picture
 from polarguide_shots.measurement.regions import Differences, Region, parse_regions, placed
+from polarguide_shots.measurement.table import Bound, Limits, faults, read_limits
 
 
 def test_regions_with_and_without_names() -> None:
@@ -59,26 +59,26 @@ def test_a_regions_limits_take_the_place_of_those_for_all(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize(
-    ("content", "said"),
+    ("content", "fault"),
     [
-        ({"limits": {"dolp_maen": {"max": 1}}}, "found dolp_maen. Perhaps dolp_mean"),
-        ({"limits": {"shot": {"max": 1}}}, "a field of the table"),
-        ({"limits": {"dolp_mean": {"maximum": 1}}}, "found maximum"),
-        ({"limits": {"dolp_mean": {"max": "1"}}}, "number"),
-        ({"limits": {"dolp_mean": {}}}, "min, max or both"),
-        ({"limits": {"dolp_mean": {"min": 2, "max": 1}}}, "a min up to the max"),
-        ({"limits": {"aolp_mean": {"min": -400, "max": 900}}}, "angles from 0 to 180"),
-        ({"limits": {"s0_difference": {"max": 1}}}, "--reference"),
-        ({"regions": {"nose": {"dolp_mean": {"max": 1}}}}, "found nose"),
-        ({"bounds": {}}, "found bounds"),
-        ({"format": 2, "limits": {"dolp_mean": {"max": 1}}}, "format"),
-        ({}, "at least one field"),
-        ([], "object"),
+        ({"limits": {"dolp_maen": {"max": 1}}}, Fault(found="dolp_maen", remedy="dolp_mean")),
+        ({"limits": {"shot": {"max": 1}}}, Fault(expected="a field of the table")),
+        ({"limits": {"dolp_mean": {"maximum": 1}}}, Fault(found="maximum")),
+        ({"limits": {"dolp_mean": {"max": "1"}}}, Fault(expected="number")),
+        ({"limits": {"dolp_mean": {}}}, Fault(expected="min, max or both")),
+        ({"limits": {"dolp_mean": {"min": 2, "max": 1}}}, Fault(expected="a min up to the max")),
+        ({"limits": {"aolp_mean": {"min": -400, "max": 900}}}, Fault(expected="angles from 0 to 180")),
+        ({"limits": {"s0_difference": {"max": 1}}}, Fault(remedy="--reference")),
+        ({"regions": {"nose": {"dolp_mean": {"max": 1}}}}, Fault(found="nose")),
+        ({"bounds": {}}, Fault(found="bounds")),
+        ({"format": 2, "limits": {"dolp_mean": {"max": 1}}}, Fault("format")),
+        ({}, Fault(expected="at least one field")),
+        ([], Fault(expected="object")),
     ],
 )  # fmt: skip
-def test_limits_that_are_wrong(content: object, said: str, tmp_path: Path) -> None:
+def test_limits_that_are_wrong(content: object, fault: Fault, tmp_path: Path) -> None:
     path = written(tmp_path / "l.json", content)
-    assert said in str(Fault(str(path)).raised_by(read_limits, path, ["lens"], reference=False))
+    assert str(path) in fault.raised_by(read_limits, path, ["lens"], reference=False).where
 
 
 def test_what_is_beyond() -> None:

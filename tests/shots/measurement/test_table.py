@@ -12,9 +12,8 @@ import numpy as np
 import pytest
 from faults import Fault
 
-from polarguide_shots.measurement.fields import FORMAT, KEYS
 from polarguide_shots.measurement.line import measure_shots
-from polarguide_shots.measurement.table import CSV, LINES, Entry, FileStamp, Table, stamps
+from polarguide_shots.measurement.table import CSV, FORMAT, KEYS, LINES, Entry, FileStamp, Table, stamps
 from polarguide_shots.options import MeasureOptions, ShotOptions
 
 SETTINGS = {"threshold": 0.05}
@@ -29,7 +28,7 @@ def entry(number: int, name: str = "shot", status: str = "measured") -> Entry:
 def write(folder: Path, entries: list[Entry], **options: bool) -> None:
     with Table(folder, SETTINGS, **options) as table:
         for one in entries:
-            if table.status_of(one.files) is None:
+            if table.entry_of(one.files) is None:
                 table.add(one)
 
 
@@ -45,7 +44,7 @@ def test_torn_at_any_byte_it_is_mended(tmp_path: Path) -> None:
             (tmp_path / LINES).write_bytes(lines[:cut])
             (tmp_path / CSV).write_bytes(rows[:torn])
             with Table(tmp_path, SETTINGS) as table:
-                done = [table.status_of(one.files) is not None for one in entries]
+                done = [table.entry_of(one.files) is not None for one in entries]
             assert sum(done) == lines[:cut].count(b"\n")
             write(tmp_path, entries)
             assert (tmp_path / LINES).read_bytes() == lines
@@ -77,7 +76,7 @@ def test_what_cannot_be_written_leaves_no_half_line(tmp_path: Path, monkeypatch)
             patch.setattr("os.fsync", full)
             Fault(found="No space left").raised_by(table.add, entry(1))
         assert (tmp_path / LINES).read_bytes() == before
-        assert table.status_of(entry(1).files) is None
+        assert table.entry_of(entry(1).files) is None
 
 
 def test_damage_in_the_middle_is_told(tmp_path: Path) -> None:
@@ -173,7 +172,7 @@ def test_a_time_of_no_date_is_still_a_line(tmp_path: Path) -> None:
     folder = tmp_path / "table"
     write(folder, [Entry(FORMAT, "a", files, "measured", "", (), ({"region": "all"},))])
     with Table(folder, SETTINGS) as table:
-        assert table.status_of(files) == "measured"
+        assert table.entry_of(files).status == "measured"
 
 
 @pytest.mark.parametrize("name", [LINES, "measure.json"])
@@ -210,7 +209,7 @@ def test_pictures_of_shots_of_one_name_do_not_replace_each_other(
     before = {path: path.read_bytes() for path in out.glob("*/part1.png")}
     assert len(before) == 2
     assert measured("tuesday", "part1")["picture"] == "part1-2"
-    assert measured("tuesday", "part1")["picture"] == "part1-3"  # written anew
+    assert measured("tuesday", "part1")["picture"] == "part1-3"  # the file was rewritten
     assert measured("tuesday", "part1-2")["picture"] == "part1-2-2"
     assert measured("tuesday", "PART1")["picture"] == "PART1-4"
     assert {path: path.read_bytes() for path in before} == before
@@ -224,7 +223,7 @@ def test_a_table_that_goes_away_takes_no_more_lines(tmp_path: Path, how: str) ->
         (tmp_path / "table" / LINES).unlink()
         if how == "replaced":
             (tmp_path / "table" / LINES).write_text("")
-        for act in (table.require_there, lambda: table.add(entry(1))):
+        for act in (table.require_present, lambda: table.add(entry(1))):
             Fault("table.jsonl", found="removed, renamed or replaced").raised_by(act)
 
 
@@ -237,6 +236,6 @@ def test_no_table_among_the_shots(folder: Path, reading: ShotOptions) -> None:
 
 def test_a_table_of_somebody_else_is_kept(tmp_path: Path) -> None:
     (tmp_path / CSV).write_text("mine")
-    Fault(found="a file of this name alone").raised_by(Table, tmp_path, SETTINGS)
+    Fault(found="a file of this name only").raised_by(Table, tmp_path, SETTINGS)
     assert (tmp_path / CSV).read_text() == "mine"
     Table(tmp_path, SETTINGS, overwrite=True).close()

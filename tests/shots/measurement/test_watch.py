@@ -56,7 +56,7 @@ def test_the_same_numbers_as_a_pass_over_the_folder(
 def test_a_file_in_pieces_is_measured_when_it_is_whole(
     folder: Path, tmp_path: Path, reading: ShotOptions
 ) -> None:
-    """It stays half written for longer than files take to settle, and grows meanwhile without being touched."""
+    """A file grows in pieces for longer than the time to settle, without a change of its time."""
     data = (folder / "v000.png").read_bytes()
     coming = folder / "slow.png"
     coming.write_bytes(data[: len(data) // 2])

@@ -186,7 +186,7 @@ def test_swapped_pictures_and_missing_filters_are_named(tmp_path: Path) -> None:
     polarizers = judged(with_exposures(dataclasses.replace(ones, views=tuple(views)), **said))
     found = {judgment.view: judgment for judgment in polarizers.judgments()}
     assert [name for name, judgment in found.items() if judgment.contradicts] == ["v1"]
-    assert abs(abs(found["v1"].off) - 90) < 1
+    assert abs(abs(found["v1"].estimate.off) - 90) < 1
     assert [name for name, judgment in found.items() if judgment.unfiltered] == ["v3"]
     assert polarizers.believed(ones.view("v1")).exposures == (Exposure(90.0),)  # it is said, so it holds
     warned = "\n".join(reported(tmp_path, ones, polarizers))

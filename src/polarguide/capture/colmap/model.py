@@ -90,8 +90,9 @@ def posed_model(
             model.add_camera_with_trivial_rig(colmap_camera(camera, camera_id=camera_id))
         w, *axis = quaternion(camera.rotation)
         pose = pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([*axis, w])), camera.translation)
-        image = pycolmap.Image(name=f"{view}.png", camera_id=camera_id, image_id=number)
-        model.add_image_with_trivial_frame(image, pose)
+        model.add_image_with_trivial_frame(
+            pycolmap.Image(name=f"{view}.png", camera_id=camera_id, image_id=number), pose
+        )
     return model
 
 
@@ -384,8 +385,10 @@ def read_model(root: Path) -> ColmapModel:
         remedy="Triangulate points with the known poses (colmap point_triangulator).",
     )
     beyond = f"not finite, or farther than {FARTHEST:g}, and were ignored."
-    warning = f"{dropped} of {dropped + len(points)} 3D points are {beyond}"
-    warnings = (*stale, *([warning] if dropped else []))
+    warnings = (
+        *stale,
+        *([f"{dropped} of {dropped + len(points)} 3D points are {beyond}"] if dropped else []),
+    )
     rows = {number: row for row, number in enumerate(numbers)}
     return ColmapModel(folder, files, points, colors, warnings, images, dict(model.cameras), tracks, rows)
 
@@ -596,46 +599,62 @@ def is_pinhole(camera: Any) -> bool:
     return camera.model_name in PINHOLES and all(camera.params[index] == 0 for index in extra)
 
 
-def is_sound(image: Any, camera: Any, tolerance: float) -> bool:
-    """Return True if pose and lens of pycolmap's image and camera are valid, also in single precision.
+def require_sound(where: object, image: Any, camera: Any, tolerance: float) -> None:
+    """Check pose and lens of pycolmap's image and camera.
 
-    Numbers must be finite and at most ``FARTHEST``. The quaternion must have length 1 within ``tolerance``.
+    Numbers must be finite and at most ``FARTHEST``, also in single precision. The quaternion must have length 1 within
+    ``tolerance``.
+
+    Raises:
+        PolarguideError: a number is invalid.
     """
     pose = image.cam_from_world()
     quaternion = np.asarray(pose.rotation.quat, np.float64)
-    translation = np.asarray(pose.translation)
-    unit = (np.abs(quaternion) <= 2).all() and abs(float(np.linalg.norm(quaternion)) - 1) <= tolerance
-    bounded = (np.abs(translation) <= FARTHEST).all() and (np.abs(camera.params) <= FARTHEST).all()
-    if not len(camera.focal_length_idxs()):  # a panorama
-        return False
-    inner = (camera.params[list(k)] for k in (camera.focal_length_idxs(), camera.principal_point_idxs()))
-    return bool(unit and bounded) and can_be_lens((camera.width, camera.height), *inner)
+    length = float(np.linalg.norm(quaternion))
+    require(
+        not tolerance < abs(length - 1) < FARTHEST,
+        where,
+        expected="a quaternion of length 1",
+        found=f"one of length {length:g}",
+        remedy="Normalize the quaternion, or export the model again.",
+    )
+    unit = (np.abs(quaternion) <= 2).all() and abs(length - 1) <= tolerance
+    bounded = (np.abs(pose.translation) <= FARTHEST).all() and (np.abs(camera.params) <= FARTHEST).all()
+    focal = list(camera.focal_length_idxs())  # empty for a panorama
+    inner = (camera.params[k] for k in (focal, list(camera.principal_point_idxs())))
+    require(
+        unit and bounded and focal and can_be_lens((camera.width, camera.height), *inner),
+        where,
+        expected=f"a pose and a lens of numbers up to {FARTHEST:g}, {LENS}",
+        found=f"quaternion {pose.rotation.quat}, translation {pose.translation}, camera {camera.params}",
+        remedy="Export the model again, or remove the image from it.",
+    )
 
 
 def _camera_of(folder: Path, image: Any, camera: Any) -> Camera:
-    """Convert pycolmap's image and camera to a ``Camera``."""
     where = f"{folder} (camera {camera.camera_id}, image {image.name})"
-    if not is_pinhole(camera):
-        raise PolarguideError(
-            where,
-            expected="an undistorted camera (PINHOLE or SIMPLE_PINHOLE)",
-            found=f"{camera.model_name} with parameters {', '.join(f'{value:g}' for value in camera.params)}",
-            remedy="Undistort the four intensities of each view, and the model with them.",
-        )
+    require(
+        is_pinhole(camera),
+        where,
+        expected="an undistorted camera (PINHOLE or SIMPLE_PINHOLE)",
+        found=f"{camera.model_name} with parameters {', '.join(f'{value:g}' for value in camera.params)}",
+        remedy="Undistort the four intensities of each view, and the model with them.",
+    )
+    require_sound(where, image, camera, 1e-6)
     pose = image.cam_from_world()
-    inner = (camera.focal_length_x, camera.focal_length_y, camera.principal_point_x, camera.principal_point_y)
-    if not is_sound(image, camera, 1e-6):
-        raise PolarguideError(
-            where,
-            expected=f"a unit quaternion, a translation up to {FARTHEST:g} and {LENS}",
-            found=f"quaternion {pose.rotation.quat}, translation {pose.translation}, intrinsics {inner}",
-            remedy="Export the model again.",
-        )
     rotation, translation = (
         torch.from_numpy(np.array(part, np.float64)) for part in (pose.rotation.matrix(), pose.translation)
     )
-    fx, fy, cx, cy = map(float, inner)
-    return Camera(int(camera.width), int(camera.height), fx, fy, cx, cy, rotation, translation)
+    return Camera(
+        width=int(camera.width),
+        height=int(camera.height),
+        fx=float(camera.focal_length_x),
+        fy=float(camera.focal_length_y),
+        cx=float(camera.principal_point_x),
+        cy=float(camera.principal_point_y),
+        rotation=rotation,
+        translation=translation,
+    )
 
 
 def _points_of(model: Any) -> tuple[Tensor, Tensor, tuple[tuple[int, ...], ...], list[int]]:
@@ -652,8 +671,12 @@ def _points_of(model: Any) -> tuple[Tensor, Tensor, tuple[tuple[int, ...], ...],
             if observation.has_point3D() and observation.point3D_id in observers:
                 observers[observation.point3D_id].add(number)
     ids = [numbered[place][0] for place in np.flatnonzero(finite)]
-    tracks = tuple(tuple(sorted(observers[number])) for number in ids)
-    return torch.from_numpy(places[finite]), torch.from_numpy(colors[finite]), tracks, ids
+    return (
+        torch.from_numpy(places[finite]),
+        torch.from_numpy(colors[finite]),
+        tuple(tuple(sorted(observers[number])) for number in ids),
+        ids,
+    )
 
 
 _SAMPLES = 2000
@@ -683,5 +706,6 @@ def _sees(camera: Camera, places: Tensor) -> bool:
     y = camera.fy * local[:, 1] / local[:, 2] + camera.cy
     across = _MARGIN * camera.width
     down = _MARGIN * camera.height
-    inside = (x >= -across) & (x <= camera.width + across) & (y >= -down) & (y <= camera.height + down)
-    return bool(inside.any())
+    return bool(
+        ((x >= -across) & (x <= camera.width + across) & (y >= -down) & (y <= camera.height + down)).any()
+    )

@@ -20,16 +20,15 @@ from polarguide.capture.colmap.model import (
     PosedCamera,
     find_model,
     is_pinhole,
-    is_sound,
     load_model,
     other_text_model,
     posed_images,
     posed_model,
+    require_sound,
 )
 from polarguide.capture.filter.develop import remapped_mask
 from polarguide.core.errors import PolarguideError, require
 from polarguide.core.text import listed
-from polarguide.geometry.camera import FARTHEST, LENS
 
 
 @dataclass(frozen=True)
@@ -206,14 +205,16 @@ class Poses:
         )
         self._images = {view: images[view][0] for view in self.views}
         for view in self.views:
-            if len(images[view]) > 1:
-                raise PolarguideError(
-                    self.folder,
-                    expected=f"one image called {view}",
-                    found=", ".join(sorted(image.name for image in images[view])),
-                    remedy="Keep one of them.",
-                )
-            self._require_numbers(view)
+            require(
+                len(images[view]) == 1,
+                self.folder,
+                expected=f"one image called {view}",
+                found=", ".join(sorted(image.name for image in images[view])),
+                remedy="Keep one of them.",
+            )
+            image = self._images[view]
+            where_image = f"{self.folder} (image {image.name})"
+            require_sound(where_image, image, model.cameras[image.camera_id], 1e-3)
         self._warps: dict[tuple[int, Geometry], Undistortion] = {}
         self._of_camera: dict[int, Undistortion] = {}
 
@@ -296,13 +297,13 @@ class Poses:
         if key not in self._warps:
             self._warps[key] = undistortion(camera_for_picture(self._model.cameras[number], geometry, where))
         warp = self._warps[key]
-        if self._of_camera.setdefault(number, warp) is not warp:
-            raise PolarguideError(
-                where,
-                expected="pictures of one size for one camera",
-                found=f"{geometry.size[0]}x{geometry.size[1]} and another size",
-                remedy="Use a separate camera in the model for each size.",
-            )
+        require(
+            self._of_camera.setdefault(number, warp) is warp,
+            where,
+            expected="pictures of one size for one camera",
+            found=f"{geometry.size[0]}x{geometry.size[1]} and another size",
+            remedy="Use a separate camera in the model for each size.",
+        )
         return warp
 
     def write(self, folder: Path) -> None:
@@ -312,8 +313,9 @@ class Poses:
             if image.camera_id in self._of_camera and len(image.points2D):
                 places = np.array([point.xy for point in image.points2D])
                 rays = np.nan_to_num(model.cameras[image.camera_id].cam_from_img(places))
-                target = self._of_camera[image.camera_id].target
-                moved = target.img_from_cam(np.column_stack([rays, np.ones(len(rays))]))
+                moved = self._of_camera[image.camera_id].target.img_from_cam(
+                    np.column_stack([rays, np.ones(len(rays))])
+                )
                 for point, place in zip(image.points2D, moved, strict=True):
                     point.xy = place
         for number, warp in self._of_camera.items():
@@ -321,24 +323,3 @@ class Poses:
             for name in ("model", "width", "height", "params"):
                 setattr(camera, name, getattr(warp.target, name))
         model.write_binary(str(folder))
-
-    def _require_numbers(self, view: str) -> None:
-        """Raise an error if the pose or the lens of a view is invalid."""
-        image = self._images[view]
-        camera = self._model.cameras[image.camera_id]
-        if not is_sound(image, camera, 1e-3):
-            pose = image.cam_from_world()
-            length = float(np.linalg.norm(pose.rotation.quat))
-            if 1e-3 < abs(length - 1) < FARTHEST:
-                raise PolarguideError(
-                    f"{self.folder} (image {image.name})",
-                    expected="a quaternion of length 1",
-                    found=f"one of length {length:g}",
-                    remedy="Normalize the quaternion, or export the model again.",
-                )
-            raise PolarguideError(
-                f"{self.folder} (image {image.name})",
-                expected=f"a pose and a lens of numbers up to {FARTHEST:g}, {LENS}",
-                found=f"quaternion {pose.rotation.quat}, translation {pose.translation}, camera {camera.params}",
-                remedy="Export the model again, or remove the image from it.",
-            )

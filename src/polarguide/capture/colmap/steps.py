@@ -38,7 +38,6 @@ def set_seed(options: Any, seed: int) -> None:
 
 
 def _pipeline_options(seed: int) -> pycolmap.IncrementalPipelineOptions:
-    """Create the options of mapping and triangulation with all of their seeds."""
     options = pycolmap.IncrementalPipelineOptions()
     for part in (options, options.mapper, options.triangulation):
         set_seed(part, seed)
@@ -63,8 +62,9 @@ def extract(
         pycolmap.extract_features(database, images, camera_mode=pycolmap.CameraMode.PER_IMAGE, **reading)
         return
     for group in groups:
-        mode = pycolmap.CameraMode.SINGLE
-        pycolmap.extract_features(database, images, image_names=list(group), camera_mode=mode, **reading)
+        pycolmap.extract_features(
+            database, images, image_names=list(group), camera_mode=pycolmap.CameraMode.SINGLE, **reading
+        )
 
 
 def match(seed: int, report: Report, *, database: str, matching: str) -> None:
@@ -101,11 +101,9 @@ def place(
         options.mapper.abs_pose_min_num_inliers = _WEAK_POSE
     options.ba_refine_focal_length = options.ba_refine_extra_params = free
     counts = itertools.count(3)  # the first callback follows the third picture
-
-    def report_next() -> None:
-        report(next(counts))
-
-    results = pycolmap.incremental_mapping(database, images, models, options, next_image_callback=report_next)
+    results = pycolmap.incremental_mapping(
+        database, images, models, options, next_image_callback=lambda: report(next(counts))
+    )
     for number, model in results.items():
         folder = os.path.join(models, str(number))
         os.makedirs(folder, exist_ok=True)
@@ -118,8 +116,9 @@ def triangulate(seed: int, report: Report, *, database: str, images: str, start:
     options = _pipeline_options(seed)
     for name in ("focal_length", "principal_point", "extra_params"):
         setattr(options, f"ba_refine_{name}", False)
-    model = pycolmap.Reconstruction(start)
-    pycolmap.triangulate_points(model, database, images, out, options=options).write_binary(out)
+    pycolmap.triangulate_points(
+        pycolmap.Reconstruction(start), database, images, out, options=options
+    ).write_binary(out)
 
 
 STEPS: dict[str, Callable[..., Any]] = {step.__name__: step for step in (extract, match, place, triangulate)}
@@ -141,8 +140,9 @@ def run_request() -> None:
     pycolmap.set_random_seed(request["seed"])
     try:
         step = STEPS[request["step"]]
-        value = step(request["seed"], lambda count: print(count, file=answers), **request["arguments"])
-        answer = {"value": value}
+        answer = {
+            "value": step(request["seed"], lambda count: print(count, file=answers), **request["arguments"])
+        }
     except Exception as error:  # any C++ error
         lines = str(error).strip().splitlines() or [type(error).__name__]
         answer = {"error": lines[0].rstrip(".")}

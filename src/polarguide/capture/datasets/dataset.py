@@ -16,14 +16,17 @@ from scipy.linalg import rq
 
 from polarguide.capture.calibration import Sense
 from polarguide.capture.colmap.model import PosedCamera
-from polarguide.capture.formats.arrays import (
+from polarguide.capture.formats.pictures import (
+    SUFFIXES,
+    decode_mask,
+    decode_stored,
     finite_numbers,
     read_arrays,
+    read_picture,
     read_radiance,
     require_camera,
     wrong_camera,
 )
-from polarguide.capture.formats.pictures import SUFFIXES, decode_mask, decode_stored, read_picture
 from polarguide.capture.layout import index_files
 from polarguide.core.errors import PolarguideError, PolarguideWarning, require
 from polarguide.core.text import listed
@@ -106,8 +109,9 @@ def masks_beside(root: Path, views: Mapping[str, int]) -> dict[str, Path]:
 
 def not_as_published(where: object, expected: str, found: str) -> PolarguideError:
     """Return the error of a file that differs from the published dataset."""
-    remedy = "Use the files of the dataset as they were published."
-    return PolarguideError(where, expected=expected, found=found, remedy=remedy)
+    return PolarguideError(
+        where, expected=expected, found=found, remedy="Use the files of the dataset as they were published."
+    )
 
 
 def require_published(condition: object, where: object, expected: str, found: str) -> None:
@@ -277,7 +281,8 @@ _LARGEST_SKEW = 1e-3
 """Largest skew of a pixel, relative to the focal length."""
 # Entries of IDR and related programs.
 _IDR_ENTRY = re.compile(r"((world|scale|camera)_mat_(inv_)?|pose_mat_)\d{1,6}")
-_SQUARE = ((3, 4), (4, 4))
+POSE_SHAPES = ((3, 4), (4, 4))
+"""Shapes of a camera pose in files."""
 Matrix = NDArray[np.float64]
 
 
@@ -327,7 +332,7 @@ def read_projections(path: Path) -> Projections:
             f"{inner_key}, which scales them to a picture from -1 to 1",
         )
         require_entries(path, arrays, scale_key)
-        world = finite_numbers(f"{path} ({key})", arrays[key], _SQUARE)
+        world = finite_numbers(f"{path} ({key})", arrays[key], POSE_SHAPES)
         scale = finite_numbers(f"{path} ({scale_key})", arrays[scale_key], ((4, 4),))
         size = float(np.linalg.norm(scale[:3, :3], 2))
         if size:  # the matrix must be a rotation with a uniform scale
@@ -340,7 +345,6 @@ def read_projections(path: Path) -> Projections:
 
 
 def _is_identity(matrix: NDArray[Any]) -> bool:
-    """Return True for an identity matrix of any size."""
     return (
         matrix.ndim == 2 and matrix.shape[0] == matrix.shape[1] and np.allclose(matrix, np.eye(len(matrix)))
     )
@@ -350,8 +354,11 @@ def require_known_names(path: Path, unknown: Iterable[str]) -> None:
     """Warn about unknown fields of a camera file, if there are any."""
     names = sorted(unknown)
     if names:
-        text = f"{path.name} has unknown fields, which are ignored: {listed(names)}."
-        warnings.warn(text, PolarguideWarning, stacklevel=2)
+        warnings.warn(
+            f"{path.name} has unknown fields, which are ignored: {listed(names)}.",
+            PolarguideWarning,
+            stacklevel=2,
+        )
 
 
 def decompose_projection(where: object, projection: Matrix) -> tuple[Matrix, Matrix, Matrix]:
@@ -371,16 +378,16 @@ def decompose_projection(where: object, projection: Matrix) -> tuple[Matrix, Mat
     signs = np.diag(np.sign(np.diag(inner)))
     inner = inner @ signs
     rotation = signs @ rotation
-    translation = np.linalg.solve(inner, projection[:, 3])
-    return checked_intrinsics(where, inner / inner[2, 2]), rotation, translation
+    return checked_intrinsics(where, inner / inner[2, 2]), rotation, np.linalg.solve(inner, projection[:, 3])
 
 
-def checked_intrinsics(where: object, inner: Matrix) -> Matrix:
-    """Check an intrinsic matrix and return it.
+def checked_intrinsics(where: object, matrix: object) -> Matrix:
+    """Check an intrinsic matrix, which may be padded to 3x4 or 4x4, and return its [3, 3] part.
 
     Raises:
-        PolarguideError: focal lengths are not positive, or pixels are skewed.
+        PolarguideError: the shape is invalid, focal lengths are not positive, or pixels are skewed.
     """
+    inner = finite_numbers(where, matrix, ((3, 3), *POSE_SHAPES))[:3, :3]
     lower = np.abs([inner[1, 0], inner[2, 0], inner[2, 1], inner[2, 2] - 1]).max()
     skew = abs(inner[0, 1]) / max(abs(inner[0, 0]), 1e-12)
     require_camera(
@@ -425,8 +432,13 @@ def distorted_camera(
         PolarguideError: the number of coefficients differs.
     """
     k = finite_numbers(where, np.ravel(np.asarray(coefficients)), ((4,), (5,), (8,)))
-    padded = [*k, *[0.0] * (8 - len(k))]
-    parameters = (inner[0, 0], inner[1, 1], inner[0, 2] + 0.5, inner[1, 2] + 0.5, *padded)
+    parameters = (
+        inner[0, 0],
+        inner[1, 1],
+        inner[0, 2] + 0.5,
+        inner[1, 2] + 0.5,
+        *[*k, *[0.0] * (8 - len(k))],
+    )
     rotation, translation = pose
     return PosedCamera(*size, "FULL_OPENCV", tuple(float(p) for p in parameters), rotation, translation)
 

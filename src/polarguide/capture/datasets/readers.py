@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from polarguide.capture.colmap.model import PosedCamera
 from polarguide.capture.datasets.dataset import (
+    POSE_SHAPES,
     Dataset,
     StokesImage,
     cameras_of_views,
@@ -33,21 +34,19 @@ from polarguide.capture.datasets.dataset import (
     require_same_shape,
     stokes_dataset,
 )
-from polarguide.capture.formats.arrays import (
-    array_kind,
-    array_size,
-    decode_arrays,
-    finite_numbers,
-    read_array,
-    read_arrays,
-    read_exr,
-)
 from polarguide.capture.formats.headers import LARGEST_PIXELS
 from polarguide.capture.formats.pictures import (
     SUFFIXES,
+    array_kind,
+    array_size,
+    decode_arrays,
     decode_picture,
     decode_stored,
+    finite_numbers,
     linear_codes,
+    read_array,
+    read_arrays,
+    read_exr,
     read_picture,
     stated_size,
 )
@@ -206,8 +205,9 @@ def _cameras(
         offsets[-1],
     )
     cameras = {number: pinhole_camera(size, *camera) for number, camera in known.items()}
-    numbers = {view: number + chosen for view, number in views.items()}
-    return cameras_of_views(path, numbers, cameras, "world_mat_"), chosen
+    return cameras_of_views(
+        path, {view: number + chosen for view, number in views.items()}, cameras, "world_mat_"
+    ), chosen
 
 
 def _camera_size(path: Path, inner: Sequence[NDArray[np.float64]], size: Size, light: Path | None) -> Size:
@@ -276,8 +276,9 @@ def open_neisf(root: Path) -> Dataset:
     files = {view: [root / part / f"{view}.exr" for part in _NEISF_PARTS] for view in numbers}
     cameras_file = root / "poses_bounds.npy"
     cameras = cameras_of_views(cameras_file, numbers, _llff_cameras(cameras_file), "row ")
-    masks = masks_beside(root, numbers)
-    return stokes_dataset("neisf", _NEISF_PARTS, files, cameras_file, cameras, masks, sense_known=False)
+    return stokes_dataset(
+        "neisf", _NEISF_PARTS, files, cameras_file, cameras, masks_beside(root, numbers), sense_known=False
+    )
 
 
 def _llff_cameras(path: Path) -> dict[int, PosedCamera]:
@@ -304,12 +305,10 @@ def _llff_cameras(path: Path) -> dict[int, PosedCamera]:
         axes = np.column_stack([np.stack([right, down, -back]), np.zeros(3)])
         rotation, _ = checked_pose(where, axes)
         middle = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
-        size = round(width), round(height)
-        cameras[index + 1] = pinhole_camera(size, middle, rotation, -rotation @ center)
+        cameras[index + 1] = pinhole_camera(
+            (round(width), round(height)), middle, rotation, -rotation @ center
+        )
     return cameras
-
-
-_SHAPES = ((3, 4), (4, 4))
 
 
 def open_gnerp(root: Path, *, transfer: str) -> Dataset:
@@ -392,9 +391,8 @@ def _gnerp_cameras(path: Path, size: tuple[int, int]) -> dict[int, PosedCamera]:
         inner_key = f"intrinsic_{match[1]}" if f"intrinsic_{match[1]}" in content else "intrinsic"
         require_entries(path, content, inner_key)
         where = f"{path} ({inner_key})"
-        inner = finite_numbers(where, content[inner_key], ((3, 3), *_SHAPES))[:3, :3]
-        pose = checked_pose(f"{path} ({key})", finite_numbers(f"{path} ({key})", value, _SHAPES))
-        cameras[int(match[1])] = pinhole_camera(size, checked_intrinsics(where, inner), *pose)
+        pose = checked_pose(f"{path} ({key})", finite_numbers(f"{path} ({key})", value, POSE_SHAPES))
+        cameras[int(match[1])] = pinhole_camera(size, checked_intrinsics(where, content[inner_key]), *pose)
     if not cameras:
         require_entries(path, content, "w2c_mat_<i>")
     require_known_names(path, (key for key in content if _GNERP_ENTRY.fullmatch(key) is None))
@@ -419,10 +417,10 @@ def open_phygap(root: Path) -> Dataset:
     arrays = read_arrays(path)
     require_entries(path, arrays, "intrinsics", "extrinsics", "image_width", "image_height")
     require_known_names(path, arrays.keys() - _PHYGAP_ENTRIES)
-    inner = checked_intrinsics(f"{path} (intrinsics)", finite_numbers(path, arrays["intrinsics"], ((3, 3),)))
+    inner = checked_intrinsics(f"{path} (intrinsics)", arrays["intrinsics"])
     poses = arrays["extrinsics"]
     require_published(
-        poses.ndim == 3 and poses.shape[1:] in _SHAPES,
+        poses.ndim == 3 and poses.shape[1:] in POSE_SHAPES,
         f"{path} (extrinsics)",
         "matrices N x 4 x 4",
         array_size(poses),
@@ -438,8 +436,9 @@ def open_phygap(root: Path) -> Dataset:
     cameras = {}
     for number, pose in enumerate(poses):
         where = f"{path} (extrinsics {number})"
-        rigid = checked_pose(where, finite_numbers(where, pose, _SHAPES))
-        cameras[number] = pinhole_camera(size, inner, *rigid)
+        cameras[number] = pinhole_camera(
+            size, inner, *checked_pose(where, finite_numbers(where, pose, POSE_SHAPES))
+        )
 
     return stokes_dataset(
         "phygap",
@@ -481,8 +480,7 @@ def open_pisr(root: Path) -> Dataset:
     intrinsics = read_arrays(inner_file)
     require_entries(inner_file, intrinsics, "camera_matrix", "dist_coeffs")
     require_known_names(inner_file, intrinsics.keys() - _PISR_ENTRIES)
-    where = f"{inner_file} (camera_matrix)"
-    inner = checked_intrinsics(where, finite_numbers(where, intrinsics["camera_matrix"], ((3, 3),)))
+    inner = checked_intrinsics(f"{inner_file} (camera_matrix)", intrinsics["camera_matrix"])
     coefficients = intrinsics["dist_coeffs"]
     cameras = {
         number: distorted_camera(f"{inner_file} (dist_coeffs)", _PISR_SIZE, inner, coefficients, pose)
@@ -538,8 +536,7 @@ def detect_dataset(root: Path) -> str | None:
     """Return the name of the dataset whose layout a folder has, or None."""
     folder = _first_path(root, STOKES_FOLDERS)
     if folder.is_dir():
-        archived = any(path.suffix.lower() == ".npz" for path in folder.iterdir())
-        return "nersp" if archived else "pandora"
+        return "nersp" if any(path.suffix.lower() == ".npz" for path in folder.iterdir()) else "pandora"
     for name, (parts, _) in DATASETS.items():
         if parts and all(
             (root / part).is_dir() if part[-1] == "/" else (root / part).is_file() for part in parts

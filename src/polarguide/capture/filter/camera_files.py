@@ -20,9 +20,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
+from PIL.ExifTags import IFD, Base
 
 from polarguide.capture.calibration import Calibration
-from polarguide.capture.formats.arrays import array_kind
 from polarguide.capture.formats.headers import (
     LARGEST_PIXELS,
     ORIENTATION,
@@ -32,7 +32,7 @@ from polarguide.capture.formats.headers import (
     picture_kind,
     png_chunk,
 )
-from polarguide.capture.formats.pictures import read_picture
+from polarguide.capture.formats.pictures import array_kind, read_picture
 from polarguide.core.errors import PolarguideError, optional_import
 from polarguide.core.files import read_file
 from polarguide.core.text import listed
@@ -208,7 +208,7 @@ def tags_of(data: bytes) -> dict[int, Any]:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             exif.load(_block_of_tags(data))
-            return {**exif, **exif.get_ifd(_DIRECTORY)}
+            return {**exif, **exif.get_ifd(IFD.Exif)}
     except Exception:  # Pillow raises many undocumented classes for damaged tags
         return {}
 
@@ -227,21 +227,11 @@ def _block_of_tags(data: bytes) -> bytes:
     return block if picture_kind(block) == "TIFF" else b""
 
 
-_MAKER = 271
-_MODEL = 272
-_DIRECTORY = 34665
-_TIME = 33434
-_F_NUMBER = 33437
-_ISO = 34855
 _ISO_TOO_LARGE = 65535
 """Value of the tag ISO for values of more than 16 bits."""
-_LARGER_ISO = (34866, 34865, 34867)
+_LARGER_ISO = (Base.RecommendedExposureIndex, Base.StandardOutputSensitivity, Base.ISOSpeed)
 """Tags with larger ISO values: recommended exposure index, standard output sensitivity, ISO speed (EXIF 2.3)."""
-_FOCAL_LENGTH = 37386
-_FOCAL_LENGTH_OF_FILM = 41989
-_SERIAL_NUMBER = 42033
-_LENS = 42036
-_DIGITAL_ZOOM = 41988
+
 _FOCAL_AGREES = 0.01
 """Relative tolerance of equal focal lengths: tags are rounded, and focus changes the focal length."""
 
@@ -328,9 +318,9 @@ def read_exposure_data(path: Path) -> ExposureData:
 def exif_data(data: bytes) -> ExposureData:
     """Return the exposure data in the EXIF tags of a picture file; damaged tags count as missing."""
     tags = tags_of(data)
-    names = (str(tags.get(tag, "")).partition("\0")[0].strip() for tag in (_MAKER, _MODEL))
-    camera = " ".join(filter(None, names))
-    seconds, iso, f_number = (number_of(tags.get(tag)) for tag in (_TIME, _ISO, _F_NUMBER))
+    camera = _joined_texts(tags, Base.Make, Base.Model)
+    exposure = (Base.ExposureTime, Base.ISOSpeedRatings, Base.FNumber)
+    seconds, iso, f_number = (number_of(tags.get(tag)) for tag in exposure)
     if iso == _ISO_TOO_LARGE:
         iso = next(filter(None, (number_of(tags.get(tag)) for tag in _LARGER_ISO)), None)
     return _plausible(camera, _lens(camera, tags), seconds, iso, f_number)
@@ -342,15 +332,19 @@ def _lens(camera: str, tags: dict[int, Any]) -> Lens:
     A stated focal length distinguishes lenses. Otherwise, serial number and name of the lens do. Pictures with digital
     zoom have another camera, because only some makers include it in the focal length.
     """
-    zoom = number_of(tags.get(_DIGITAL_ZOOM))
+    zoom = number_of(tags.get(Base.DigitalZoomRatio))
     if zoom is not None and zoom > 0 and zoom != 1:  # 0 means no zoom
         camera = f"{camera} zoom {zoom:.3g}".lstrip()
-    focal, of_film = (number_of(tags.get(tag)) for tag in (_FOCAL_LENGTH, _FOCAL_LENGTH_OF_FILM))
-    stated = [(unit, value) for unit, value in (("film", of_film), ("lens", focal)) if value and value > 0]
-    if stated:
-        return Lens(f"{camera} ({stated[0][0]})", stated[0][1])
-    more = (str(tags.get(tag, "")).partition("\0")[0].strip() for tag in (_SERIAL_NUMBER, _LENS))
-    return Lens(" ".join(filter(None, (camera, *more))))
+    for unit, tag in (("film", Base.FocalLengthIn35mmFilm), ("lens", Base.FocalLength)):
+        focal = number_of(tags.get(tag))
+        if focal and focal > 0:
+            return Lens(f"{camera} ({unit})", focal)
+    return Lens(f"{camera} {_joined_texts(tags, Base.BodySerialNumber, Base.LensModel)}".strip())
+
+
+def _joined_texts(tags: dict[int, Any], *names: int) -> str:
+    """Return the texts of some tags, separated by blanks."""
+    return " ".join(filter(None, (str(tags.get(name, "")).partition("\0")[0].strip() for name in names)))
 
 
 def camera_groups(paths: Mapping[str, Path]) -> dict[str, Lens]:

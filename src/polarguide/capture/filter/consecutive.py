@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import cv2
@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 from polarguide.capture.filter.camera_files import is_camera_raw, read_camera_raw
 from polarguide.capture.formats.pictures import decode_picture, read_picture
-from polarguide.capture.write import write_png
+from polarguide.capture.write import write_png_file
 from polarguide.core.errors import PolarguideError
 from polarguide.core.files import make_folder, write_text
-from polarguide.core.progress import Reporter
+from polarguide.core.progress import Advance, Reporter
 from polarguide.geometry.polarizer import ANGLES
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
@@ -122,32 +122,30 @@ def extract_frames(video: Path, folder: Path, reporter: Reporter) -> int:
     write_text(done, "unfinished\n")
     for old in folder.glob("frame_*.png"):
         old.unlink()
-    best: tuple[int, float, NDArray[np.uint8]] | None = None
     written = 0
-    with reporter.track("taking frames", total) as advance:
-        for number in range(total):
-            read, picture = reader.read()
-            if not read:
-                break
-            span = number * wanted // total
-            if best is not None and best[0] != span:
-                _write(folder, written, best[2])
-                written += 1
-                best = None
-            sharpness = float(cv2.Laplacian(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY), cv2.CV_32F).var())
-            if best is None or sharpness > best[1]:
-                best = span, sharpness, np.asarray(picture, np.uint8)
-            advance(number + 1)
+    with reporter.track("reading frames", total) as advance:
+        frames = enumerate(_frames(reader, total, advance))
+        for _, interval in itertools.groupby(frames, key=lambda frame: frame[0] * wanted // total):
+            _, sharpest = max(interval, key=lambda frame: _sharpness(frame[1]))
+            write_png_file(folder / f"frame_{written:04d}.png", np.ascontiguousarray(sharpest[..., ::-1]))
+            written += 1
     reader.release()
-    if best is not None:
-        _write(folder, written, best[2])
-        written += 1
     write_text(done, record)
     return written
 
 
-def _write(folder: Path, number: int, picture: NDArray[np.uint8]) -> None:
-    write_png(folder / f"frame_{number:04d}.png", np.ascontiguousarray(picture[..., ::-1]))
+def _frames(reader: cv2.VideoCapture, total: int, advance: Advance) -> Iterator[NDArray[np.uint8]]:
+    """Yield up to ``total`` frames of a video, BGR."""
+    for number in range(total):
+        is_read, picture = reader.read()
+        if not is_read:
+            return
+        advance(number + 1)
+        yield np.asarray(picture, np.uint8)
+
+
+def _sharpness(picture: NDArray[np.uint8]) -> float:
+    return float(cv2.Laplacian(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY), cv2.CV_32F).var())
 
 
 _MANY = 100

@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 import tifffile
 from PIL import Image
+from PIL.ExifTags import Base
 
 from polarguide.capture import checks
 from polarguide.capture.exposures import Angle
@@ -42,10 +43,7 @@ _CHARACTERISTICS = {
 }
 """Exponents of transfer characteristics (ITU-T H.273). Television's are displayed like sRGB."""
 _UNSPECIFIED = 2
-_TIFF_PROFILE = 34675
-_TRANSFER_FUNCTION = 301
-_COLOR_SPACE = 40961
-_GAMMA = 42240
+
 _CURVES = (b"rTRC", b"kTRC")
 _PARAMETERS = {0: 1, 1: 3, 2: 4, 3: 5, 4: 7}
 _MIDDLE = 0.5
@@ -103,18 +101,18 @@ def stated_encoding(data: bytes) -> Encoding | None:
     if rest is not None:
         return rest
     tags = tags_of(data)
-    gamma = number_of(tags.get(_GAMMA))
+    gamma = number_of(tags.get(Base.Gamma))
     if gamma is not None and gamma > 0:
         return Encoding(gamma, f"EXIF gamma {gamma:.3g}")
-    return Encoding(SRGB_EXPONENT, "EXIF color space sRGB") if tags.get(_COLOR_SPACE) == 1 else None
+    return Encoding(SRGB_EXPONENT, "EXIF color space sRGB") if tags.get(Base.ColorSpace) == 1 else None
 
 
 def _of_tiff(data: bytes) -> tuple[bytes | None, Encoding | None]:
     """Return the ICC profile of a TIFF file, and the encoding by its transfer function."""
     with tifffile.TiffFile(io.BytesIO(data)) as file:
         tags = file.pages.first.tags
-        profile = tags.valueof(_TIFF_PROFILE)
-        function = tags.valueof(_TRANSFER_FUNCTION)
+        profile = tags.valueof(int(Base.InterColorProfile))
+        function = tags.valueof(int(Base.TransferFunction))
         count = 1 << int(file.pages.first.bitspersample)
     curve = np.ravel([] if function is None else function)  # one curve for all colors, or one after the other
     place = round(_MIDDLE * (count - 1))

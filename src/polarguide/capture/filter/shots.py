@@ -207,21 +207,17 @@ def read_stack(
     Raises:
         PolarguideError: a file cannot be read, or files differ in size, depth or orientation.
     """
-    pictures: list[NDArray[Any]] = []
-    first_code = None
-    for path in paths:
-        picture, code = _read_shot(path, gains)
-        pictures.append(picture)
-        first_code = first_code or code
+    pictures, codes = zip(*(_read_shot(path, gains) for path in paths), strict=True)
+    for path, picture, code in zip(paths, pictures, codes, strict=True):
         require_alike(path, picture, paths[0], pictures[0])
-        if code != first_code:
+        if code != codes[0]:
             raise PolarguideError(
                 path,
-                expected=f"EXIF orientation {first_code} like {paths[0].name}",
+                expected=f"EXIF orientation {codes[0]} like {paths[0].name}",
                 found=str(code),
                 remedy="Do not move the camera between the shots of a view, or export all with the same settings.",
             )
-    return stacked(np.stack(pictures), code, lossy=is_lossy(paths[0]), levels=levels)
+    return stacked(np.stack(pictures), codes[0], lossy=is_lossy(paths[0]), levels=levels)
 
 
 def stacked(

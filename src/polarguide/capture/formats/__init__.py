@@ -1,1 +1,1 @@
-"""Decode files of pictures and arrays, with strict checks and limits on size."""
+"""Decoders of picture and array files, with strict checks and limits on size."""

@@ -1,7 +1,7 @@
-"""Check that a picture file is complete, by its structure.
+"""Parse the structure of picture files, and check that they are complete.
 
-Decoders differ in their treatment of truncated files: some refuse them, some return gray or stale rows for the missing
-part. Parsing the structure first gives the same answer with every decoder.
+Decoders differ for truncated files: some refuse them, some return gray or old rows for the missing part. The check of
+the structure gives the same result for every decoder.
 """
 
 from __future__ import annotations
@@ -34,38 +34,38 @@ _KINDS = re.compile(
     rb"|(?P<HEIF>.{4}ftyp(?:heic|heix|hevc|heim|heis|mif1|msf1|avif|avis))",
     re.DOTALL,
 )
-"""First bytes of the kinds of picture files."""
+"""Kinds of picture files by their first bytes."""
 TIFFS = ("TIFF", "BigTIFF")
-# Within JPEG scan data, 0xFF followed by 0 is a stuffed byte and by 0xD0-0xD7 a restart; all else ends it.
+# The end of JPEG scan data. In the data, 0xFF is followed by 0 (a stuffed byte) or by 0xD0-0xD7 (a restart).
 _JPEG_SCAN_END = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")
 ORIENTATION = 274
-# Marks without a length: one that nobody uses, and restarts.
+# JPEG markers without a length: an unused one, and restarts.
 _JPEG_ALONE = (0x01, *range(0xD0, 0xD8))
-# Largest number of scans of a progressive JPEG file. Encoders write about ten, and decoding an empty one costs as much.
+# Largest number of scans of a progressive JPEG file. Encoders write about ten; decoding an empty one costs as much.
 _MOST_SCANS = 200
 LARGEST_PIXELS = 150_000_000
-"""More pixels than any camera has: a file that claims more is refused before memory is taken for it."""
+"""Upper bound of the pixels of a camera. Larger files are refused before memory is allocated."""
 
 
 def damaged(path: Path, expected: str, found: str) -> PolarguideError:
-    """The error that a file cannot be decoded."""
+    """Return the error of a file that cannot be decoded."""
     return PolarguideError(path, expected=expected, found=found, remedy="Copy or export the file again.")
 
 
 def picture_kind(data: bytes) -> str:
-    """The kind of a picture file by its first bytes: PNG, JPEG, TIFF, BigTIFF, BMP, PNM, WebP, HEIF; else empty."""
+    """Return the kind of a picture file: PNG, JPEG, TIFF, BigTIFF, BMP, PNM, WebP, HEIF, or an empty text."""
     match = _KINDS.match(data)
     return "" if match is None else str(match.lastgroup)
 
 
 def find_damage(data: bytes) -> str | None:
-    """The damage that the structure of a picture file shows, in words, or None.
+    """Describe the damage in the structure of a picture file, or return None.
 
     Args:
-        data: the whole file.
+        data: content of the file.
 
     Returns:
-        A noun phrase for the "found" part of a message: "an empty file", "a PNG file cut short", ...
+        A noun phrase for the field ``found`` of an error: "an empty file", "a PNG file cut short", ...
     """
     kind = picture_kind(data)
     if kind:
@@ -74,7 +74,7 @@ def find_damage(data: bytes) -> str | None:
 
 
 def declared_size(data: bytes) -> tuple[int, int] | None:
-    """Width and height in the header of a picture file; None where decoders might see others, or none."""
+    """Return width and height in the header of a picture file; None if it is invalid or ambiguous for decoders."""
     kind = picture_kind(data)
     if kind == "PNG":
         return struct.unpack_from(">II", data, 16) if data[12:16] == b"IHDR" and len(data) >= 24 else None
@@ -85,7 +85,7 @@ def declared_size(data: bytes) -> tuple[int, int] | None:
 
 
 def png_chunks(data: bytes) -> Iterator[tuple[bytes, int, int]]:
-    """Kind, start and end of the chunks of a PNG file; the last may end beyond the file."""
+    """Yield kind, start and end of the chunks of a PNG file. The last may end beyond the file."""
     at = 8
     while at + 12 <= len(data):
         length, kind = struct.unpack_from(">I4s", data, at)
@@ -94,18 +94,18 @@ def png_chunks(data: bytes) -> Iterator[tuple[bytes, int, int]]:
 
 
 def png_chunk(data: bytes, kind: bytes) -> bytes | None:
-    """The content of the first chunk of a kind in a PNG file; None where there is none."""
+    """Return the content of the first chunk of a kind in a PNG file, or None."""
     return next((data[at + 8 : end - 4] for name, at, end in png_chunks(data) if name == kind), None)
 
 
 def significant_bits(data: bytes) -> int | None:
-    """The largest count of significant bits of gray or a color that a PNG file states (sBIT)."""
+    """Return the largest number of significant bits of gray or a color in a PNG file (sBIT), or None."""
     stated = png_chunk(data, b"sBIT")
     return max(stated[:3] if len(stated) > 2 else stated[:1]) if stated else None
 
 
 def _jpeg_marks(data: bytes) -> Iterator[int]:
-    """Kinds of the segments and scans of a JPEG file up to its end-of-image mark."""
+    """Yield the markers of the segments and scans of a JPEG file up to its end-of-image marker."""
     at = 2
     while at + 2 <= len(data) and data[at] == 0xFF:
         kind = data[at + 1]
@@ -123,7 +123,7 @@ def _jpeg_marks(data: bytes) -> Iterator[int]:
 
 
 def _png_damage(data: bytes) -> str | None:
-    """Walk the chunks of a PNG file and check their checksums."""
+    """Check chunks and checksums of a PNG file."""
     if declared_size(data) is None and len(data) >= 24:
         return "a PNG file that does not begin with its size"
     for kind, at, end in png_chunks(data):
@@ -132,7 +132,7 @@ def _png_damage(data: bytes) -> str | None:
         (stored,) = struct.unpack_from(">I", data, end - 4)
         if zlib.crc32(memoryview(data)[at + 4 : end - 4]) != stored:
             return f"a damaged PNG file (wrong checksum at byte {at})"
-        if kind == b"acTL":  # decoders show any one of its pictures, or none
+        if kind == b"acTL":  # decoders return different frames
             return "an animated PNG file"
         if kind == b"IEND":
             return None
@@ -140,7 +140,7 @@ def _png_damage(data: bytes) -> str | None:
 
 
 def _jpeg_damage(data: bytes) -> str | None:
-    """Describe the damage of a JPEG file: no end-of-image mark, too many scans, or no size; None for a sound one."""
+    """Describe the damage of a JPEG file: no end-of-image marker, too many scans, or no size."""
     kinds = list(_jpeg_marks(data))
     if 0xD9 not in kinds:
         return f"a JPEG file cut short (it ends after {len(data)} bytes)"
@@ -157,10 +157,12 @@ _LARGEST_HEAD = 4096
 
 @dataclass(frozen=True)
 class PnmHead:
-    """The header of a PGM or PPM file.
+    """Header of a PGM or PPM file.
 
     Attributes:
-        size: width and height. full: value of full scale. end: where the samples end.
+        size: width and height.
+        full: value of full scale.
+        end: end of the samples in the file.
     """
 
     size: tuple[int, int]
@@ -169,7 +171,7 @@ class PnmHead:
 
 
 def pnm_head(data: bytes) -> PnmHead | None:
-    """The header of a PGM or PPM file; None where it has none that is read. Pillow does not tell full scale."""
+    """Parse the header of a PGM or PPM file; None if it is invalid."""
     match = _PNM_HEAD.match(data[:_LARGEST_HEAD])
     if match is None:
         return None
@@ -180,7 +182,7 @@ def pnm_head(data: bytes) -> PnmHead | None:
 
 
 def pnm_damage(data: bytes) -> str | None:
-    """The damage that the structure of a PGM or PPM file shows, in words, or None."""
+    """Describe the damage in the structure of a PGM or PPM file, or return None."""
     head = pnm_head(data)
     if head is None:
         return "a PGM or PPM file without a size and full scale"
@@ -191,23 +193,23 @@ _PILLOW: dict[str, Any] = {"BMP": BmpImageFile, "JPEG": JpegImageFile, "WebP": W
 
 
 def opened_picture(data: bytes) -> Any:
-    """A BMP, JPEG or WebP file as Pillow opens it, which decodes nothing yet. It needs the whole of a WebP file.
+    """Open a BMP, JPEG or WebP file with Pillow without decoding it. WebP needs the whole file.
 
     Raises:
-        Exception: of several kinds, where the file is damaged.
+        Exception: the file is damaged; several kinds.
     """
     return _PILLOW[picture_kind(data)](io.BytesIO(data))
 
 
 def _pillow_head(data: bytes) -> Any:
-    """``opened_picture``; None where the file is damaged or of another kind."""
+    """Open a file with ``opened_picture``; None if it is damaged or of another kind."""
     with contextlib.suppress(Exception):
         return opened_picture(data)
     return None
 
 
 def pillow_damage(data: bytes) -> str | None:
-    """The damage that the structure of a BMP or WebP file shows, in words, or None."""
+    """Describe the damage in the structure of a BMP or WebP file, or return None."""
     name = picture_kind(data)
     end = 0
     try:
@@ -218,14 +220,12 @@ def pillow_damage(data: bytes) -> str | None:
             if picture.info["compression"] or ";" in stored:
                 return "a BMP file without 8, 24 or 32 bits a pixel, not compressed"
             if start != int.from_bytes(data[10:14], "little"):
-                return (
-                    "a BMP file that states no place of its pixels, of which decoders make different pictures"
-                )
+                return "a BMP file without the place of its pixels, which decoders read differently"
             end = start + row * height
         elif picture.n_frames > 1:
             return "an animated WebP file"
-    except Image.DecompressionBombError:  # its limit is higher than ours
-        return "a WebP file whose size is more than any camera takes"
+    except Image.DecompressionBombError:
+        return "a WebP file with more pixels than any camera has"
     except Exception:
         end = len(data) + 1
     return (
@@ -235,18 +235,19 @@ def pillow_damage(data: bytes) -> str | None:
 
 _AVIF = (b"avif", b"avis")
 _ORIENTATION_OF_TURNS = (1, 8, 3, 6)
-"""EXIF's number for quarter turns counter-clockwise."""
+"""EXIF's orientation by quarter turns counter-clockwise."""
 HIGH_RANGE = {16: "PQ", 18: "HLG"}
-"""Transfer characteristics (ITU-T H.273) of displays, which depend on more than the light at a pixel."""
+"""Transfer characteristics (ITU-T H.273) for displays, which depend on more than the light at a pixel."""
 
 
 @dataclass(frozen=True)
 class HeifHead:
-    """The header of a HEIC file.
+    """Header of a HEIC file.
 
     Attributes:
-        size: width and height as stored, before it is turned. turns: quarter turns counter-clockwise for display.
-        mirrored: whether it is mirrored for display.
+        size: stored width and height, before rotation for display.
+        turns: quarter turns counter-clockwise for display.
+        mirrored: True if the picture is mirrored for display.
     """
 
     size: tuple[int, int]
@@ -255,12 +256,12 @@ class HeifHead:
 
     @property
     def orientation(self) -> int:
-        """The turn as EXIF's number. The tag itself is for information only (ISO/IEC 23008-12)."""
+        """Rotation as EXIF's orientation. The EXIF tag itself is informative only (ISO/IEC 23008-12)."""
         return _ORIENTATION_OF_TURNS[self.turns]
 
 
 def heif_head(data: bytes) -> HeifHead | None:
-    """The header of a HEIC file; None where it states no size of its picture."""
+    """Parse the header of a HEIC file; None if it states no size."""
     try:
         boxes = {kind: (start, end) for kind, start, end in _boxes(data, 0, len(data))}
         start, end = boxes[b"meta"]
@@ -269,10 +270,10 @@ def heif_head(data: bytes) -> HeifHead | None:
         (primary,) = struct.unpack_from(">I" if wide else ">H", data, meta[b"pitm"][0] + 4)
         inside = {kind: span for kind, *span in _boxes(data, *meta[b"iprp"])}
         properties = list(_boxes(data, *inside[b"ipco"]))
-        own = [properties[number - 1] for number in _associated(data, inside[b"ipma"][0], primary) if number]
+        own = [properties[number - 1] for number in _properties(data, inside[b"ipma"][0], primary) if number]
         at = {kind: start for kind, start, _ in own}
         width, height = struct.unpack_from(">II", data, at[b"ispe"] + 4)
-        if b"clap" in at:  # encoders fill blocks up, and cut what they added off again
+        if b"clap" in at:  # encoders pad pictures to whole blocks
             across, of_across, down, of_down = struct.unpack_from(">4I", data, at[b"clap"])
             width = across // of_across
             height = down // of_down
@@ -283,7 +284,7 @@ def heif_head(data: bytes) -> HeifHead | None:
 
 
 def _boxes(data: bytes, start: int, end: int) -> Iterator[tuple[bytes, int, int]]:
-    """Kind, start and end of the contents of the boxes in a part of a file; the last may end beyond it."""
+    """Yield kind, start and end of the contents of the boxes in a part of a file. The last may end beyond it."""
     while start + 8 <= end:
         length, kind = struct.unpack_from(">I4s", data, start)
         head = 8
@@ -297,8 +298,8 @@ def _boxes(data: bytes, start: int, end: int) -> Iterator[tuple[bytes, int, int]
         start += length
 
 
-def _associated(data: bytes, start: int, item: int) -> list[int]:
-    """Numbers, from 1, of the properties of an item, by the box of associations at ``start``."""
+def _properties(data: bytes, start: int, item: int) -> list[int]:
+    """Return the numbers, from 1, of the properties of an item in the box of associations at ``start``."""
     version = data[start]
     wide = data[start + 3] & 1
     (count,) = struct.unpack_from(">I", data, start + 4)
@@ -307,7 +308,7 @@ def _associated(data: bytes, start: int, item: int) -> list[int]:
         (number,) = struct.unpack_from(">I" if version else ">H", data, start)
         start += 4 if version else 2
         length = data[start]
-        start = start + 1
+        start += 1
         if number == item:
             values = struct.unpack_from(f">{length}{'H' if wide else 'B'}", data, start)
             return [value & (0x7FFF if wide else 0x7F) for value in values]
@@ -316,7 +317,7 @@ def _associated(data: bytes, start: int, item: int) -> list[int]:
 
 
 def heif_damage(data: bytes) -> str | None:
-    """The damage that the structure of a HEIC or AVIF file shows, in words, or None."""
+    """Describe the damage in the structure of a HEIC or AVIF file, or return None."""
     if data[8:12] in _AVIF:
         return "an AVIF file"
     if max((end for _, _, end in _boxes(data, 0, len(data))), default=0) > len(data):
@@ -328,38 +329,39 @@ def heif_damage(data: bytes) -> str | None:
 
 
 def heif_tags(data: bytes) -> bytes:
-    """The EXIF block of a HEIC file; empty where it has none, or pillow-heif is not installed."""
+    """Return the EXIF block of a HEIC file; empty without a block or without the package pillow-heif."""
     try:
-        opened = optional_import("pillow_heif", "EXIF").open_heif(io.BytesIO(data))
-        return bytes(opened.info.get("exif") or b"")
-    except Exception:  # no package, or a damaged file: whoever reads its pixels says so
+        return bytes(
+            optional_import("pillow_heif", "EXIF").open_heif(io.BytesIO(data)).info.get("exif") or b""
+        )
+    except Exception:  # reported when the pixels are read
         return b""
 
 
 def heif_colors(data: bytes) -> tuple[int | None, bytes | None]:
-    """Transfer characteristics and ICC profile that a HEIC file states.
+    """Return transfer characteristics and ICC profile of a HEIC file.
 
     Raises:
-        Exception: of several kinds, where the file is damaged or pillow-heif is not installed.
+        Exception: the file is damaged or pillow-heif is not installed; several kinds.
     """
     info = optional_import("pillow_heif", "color").open_heif(io.BytesIO(data)).info
     return (info.get("nclx_profile") or {}).get("transfer_characteristics"), info.get("icc_profile")
 
 
 def heif_pixels(path: Path, data: bytes) -> NDArray[Any]:
-    """The picture of a HEIC file as the camera stored it, before it is turned for display.
+    """Decode the stored picture of a HEIC file, before rotation for display.
 
     Args:
-        path: where ``data`` came from, for messages.
-        data: the whole file, without damage that its structure tells.
+        path: path of the file for messages.
+        data: content of the file, after ``find_damage``.
 
     Returns:
-        [H, W, C] uint8, or uint16 of more than 8 bits brought to full scale, in OpenCV's order of channels.
+        [H, W, C] uint8, or uint16 for more than 8 bits at full scale, in OpenCV's order of channels.
 
     Raises:
         PolarguideError: pillow-heif is not installed.
-        ValueError: the file is of a kind that is not read; the text is a noun phrase that says why.
-        Exception: of several kinds, where the file is damaged.
+        ValueError: the file is unsupported; the text is a noun phrase with the reason.
+        Exception: the file is damaged; several kinds.
     """
     library = optional_import("pillow_heif", str(path))
     head = heif_head(data)
@@ -374,21 +376,21 @@ def heif_pixels(path: Path, data: bytes) -> NDArray[Any]:
     pixels = np.asarray(opened)
     pixels = np.rot90(pixels, -head.turns)
     if pixels.shape[1::-1] != head.size:
-        raise ValueError("a HEIC file whose picture has another size than its header states")
+        raise ValueError("a HEIC file whose picture and header have different sizes")
     if pixels.dtype == np.uint8:
         return np.ascontiguousarray(pixels)
-    # The decoder puts the bits at the top of 16.
+    # The decoder shifts values to the top of 16 bits.
     return rescaled(np.ascontiguousarray(pixels >> (16 - bits)), (1 << bits) - 1)
 
 
 def rescaled(pixels: NDArray[Any], full: int) -> NDArray[Any]:
-    """Whole numbers of which ``full`` is full scale, as such of the whole range of their type."""
-    whole = np.iinfo(pixels.dtype).max
-    table = np.rint(np.minimum(np.arange(whole + 1) * (whole / full), whole)).astype(pixels.dtype)
+    """Rescale whole numbers with full scale ``full`` to the whole range of their type."""
+    largest = np.iinfo(pixels.dtype).max
+    table = np.rint(np.minimum(np.arange(largest + 1) * (largest / full), largest)).astype(pixels.dtype)
     return np.asarray(table[pixels])
 
 
-# It logs what it finds odd in a file; what matters of it is an error here.
+# tifffile logs unusual features of files. Relevant ones are errors here.
 logging.getLogger("tifffile").addHandler(logging.NullHandler())
 
 _GRAY = 1
@@ -398,36 +400,36 @@ _YCBCR = 6
 _WHITE_IS_ZERO = 0
 _SAMPLES = {_GRAY: 1, _RGB: 3, _PALETTE: 1, _YCBCR: 3}
 JPEG_IN_TIFF = (6, 7)
-"""Compressions that decode to RGB what is stored as luminance and color differences."""
+"""Compressions that convert between RGB and luminance with color differences."""
 _NO_PICTURE = 1 | 4
-"""Bits of NewSubfileType for a smaller copy and for a mask of transparency."""
+"""Bits of NewSubfileType for a thumbnail and for a transparency mask."""
 _OLD_SUBFILE_TYPE = 255
 _OLD_REDUCED = 2
-"""Value of the older tag SubfileType for a smaller copy."""
+"""Value of the older tag SubfileType for a thumbnail."""
 _MOST_PICTURES = 1000
 
 
 class UnreadableTiffError(ValueError):
-    """A TIFF file that is no ordinary picture; the text is a noun phrase that says why."""
+    """TIFF file that is not an ordinary picture; the text is a noun phrase with the reason."""
 
 
 def decode_tiff(data: bytes) -> NDArray[Any]:
-    """The picture of a TIFF or BigTIFF file, neither turned nor scaled.
+    """Decode the picture of a TIFF or BigTIFF file without rotation and scaling.
 
     Args:
-        data: the whole file.
+        data: content of the file.
 
     Returns:
-        [H, W] or [H, W, C] in OpenCV's order of channels (blue, green, red, alpha), of 8- or 16-bit whole numbers or
+        [H, W] or [H, W, C] in OpenCV's order of channels (blue, green, red, alpha), 8- or 16-bit whole numbers or
         floating-point numbers.
 
     Raises:
-        UnreadableTiffError: the file has several pictures, or samples that mean something else.
-        Exception: of a dozen kinds, where the file is damaged.
+        UnreadableTiffError: the file has several pictures, or samples with another meaning.
+        Exception: the file is damaged; several kinds.
     """
     with tifffile.TiffFile(io.BytesIO(data)) as file:
         page = _only_page(file)
-        samples, transparent = _judged(page)
+        samples, transparent = _sample_layout(page)
         pixels = np.asarray(page.asarray(maxworkers=1))
         size = (page.imagelength, page.imagewidth)
         bits = int(page.bitspersample)
@@ -440,7 +442,7 @@ def decode_tiff(data: bytes) -> NDArray[Any]:
     if bits == 1 and pixels.dtype.kind in "bu":
         pixels = pixels.astype(np.uint8) * np.uint8(255)
     if colors is not None:
-        # Palettes have 16 bits; those of 8-bit colors are multiples of 257.
+        # Palettes have 16 bits. Entries of 8-bit colors are multiples of 257.
         pixels = np.rint(np.asarray(colors).T[pixels] / 257).astype(np.uint8)
     if transparent and samples == 2:
         return pixels[..., [0, 0, 0, 1]]
@@ -457,7 +459,7 @@ _LONG8 = 16
 
 
 def tiff_size(file: BinaryIO) -> tuple[int, int] | None:
-    """Width and height in the header of a TIFF or BigTIFF file, of which no more is read; see ``_plain_size``."""
+    """Return width and height in the header of a TIFF or BigTIFF file, see ``_plain_size``."""
     with (
         contextlib.suppress(Exception),
         tifffile.TiffFile(file) as opened,
@@ -467,7 +469,7 @@ def tiff_size(file: BinaryIO) -> tuple[int, int] | None:
 
 
 def _plain_size(file: tifffile.TiffFile) -> tuple[int, int] | None:
-    """Width and height; None where a side is not there, stands there twice or has another type than usual."""
+    """Return width and height; None if a side is missing, duplicate or of an unusual type."""
     tags = file.pages.first.tags
     sides = [tag for code in _SIDES for tag in tags.getall(code) or ()]
     types = (*_PLAIN_TYPES, _LONG8) if file.is_bigtiff else _PLAIN_TYPES
@@ -477,27 +479,27 @@ def _plain_size(file: tifffile.TiffFile) -> tuple[int, int] | None:
 
 
 def tiff_damage(data: bytes) -> str | None:
-    """The damage that the structure of a TIFF or BigTIFF file shows, in words, or None."""
+    """Describe the damage in the structure of a TIFF or BigTIFF file, or return None."""
     name = picture_kind(data)
     try:
         with tifffile.TiffFile(io.BytesIO(data)) as file:
             page = file.pages.first
             (entries,) = struct.unpack_from(file.tiff.tagnoformat, data, page.offset)
             spans = zip(page.dataoffsets, page.databytecounts, strict=False)
-            # It passes over entries whose values are not in the file.
-            whole = len(page.tags) == entries and all(at + size <= len(data) for at, size in spans)
+            # tifffile skips entries whose values are outside the file.
+            complete = len(page.tags) == entries and all(at + size <= len(data) for at, size in spans)
             if _plain_size(file) is None:
                 return f"a {name} file without one plain size"
-    except Exception:  # as above
-        whole = False
-    return None if whole else f"a {name} file cut short (it ends after {len(data)} bytes)"
+    except Exception:  # tifffile raises several kinds of errors
+        complete = False
+    return None if complete else f"a {name} file cut short (it ends after {len(data)} bytes)"
 
 
 def tiff_full_scale(file: tifffile.TiffFile) -> int | None:
-    """The full scale that a TIFF file states below that of its type; None where it does not.
+    """Return the full scale that a TIFF file states, if it is below that of its type, else None.
 
-    By the bits of a sample, or by MaxSampleValue where that is all ones in binary: the tag may also hold the largest
-    value that occurs.
+    It follows from the bits of a sample, or from MaxSampleValue if this is all ones in binary. Other values of
+    MaxSampleValue may be the largest value that occurs.
     """
     page = file.pages.first
     kind = page.dtype
@@ -513,27 +515,27 @@ def tiff_full_scale(file: tifffile.TiffFile) -> int | None:
 
 
 def _only_page(file: tifffile.TiffFile) -> tifffile.TiffPage:
-    """The page of the picture.
+    """Return the page of the picture.
 
     Raises:
-        UnreadableTiffError: there are several, or it begins with another one.
+        UnreadableTiffError: the file has several pictures, or its first page is a thumbnail.
     """
     pages = [page.aspage() for page in itertools.islice(file.pages, _MOST_PICTURES)]
-    whole = [
+    pictures = [
         page
         for page in pages
         if not page.subfiletype & _NO_PICTURE and page.tags.valueof(_OLD_SUBFILE_TYPE) != _OLD_REDUCED
     ]
     stacked = int((file.imagej_metadata or {}).get("images", 1))
-    if len(whole) > 1 or stacked > 1:
-        raise UnreadableTiffError(f"a TIFF file of {max(len(whole), stacked)} pictures")
-    if not whole or whole[0] is not pages[0]:
-        raise UnreadableTiffError("a TIFF file that begins with a smaller copy of its picture")
-    return whole[0]
+    if len(pictures) > 1 or stacked > 1:
+        raise UnreadableTiffError(f"a TIFF file of {max(len(pictures), stacked)} pictures")
+    if not pictures or pictures[0] is not pages[0]:
+        raise UnreadableTiffError("a TIFF file that begins with a thumbnail of its picture")
+    return pictures[0]
 
 
-def _judged(page: tifffile.TiffPage) -> tuple[int, bool]:
-    """Samples of a pixel, and whether the last is transparency.
+def _sample_layout(page: tifffile.TiffPage) -> tuple[int, bool]:
+    """Return the number of samples per pixel, and True if the last is transparency.
 
     Raises:
         UnreadableTiffError: the samples are not those of a gray or a color picture.
@@ -547,13 +549,13 @@ def _judged(page: tifffile.TiffPage) -> tuple[int, bool]:
         raise UnreadableTiffError(f"a TIFF file of the color model {name}")
     more = samples - _SAMPLES[meaning]
     extra = tuple(int(kind) for kind in page.extrasamples)
-    # Many writers leave the fourth sample of RGB unnamed; a second one of gray may be anything.
+    # Many writers leave the fourth sample of RGB unspecified. A second sample of gray may be anything.
     alpha = more == 1 and meaning in (_GRAY, _RGB) and (meaning == _RGB or extra[:1] in {(1,), (2,)})
     if more and not alpha:
-        what = "gray" if meaning == _GRAY else "color"
-        raise UnreadableTiffError(f"a TIFF file of {samples} samples a pixel, more than {what} has")
-    whole = page.dtype is not None and page.dtype.kind in "bu" and page.dtype.itemsize <= 2
-    if page.dtype is None or not (whole or page.dtype.kind == "f"):
+        kind = "gray" if meaning == _GRAY else "color"
+        raise UnreadableTiffError(f"a TIFF file of {samples} samples a pixel, more than {kind} has")
+    integers = page.dtype is not None and page.dtype.kind in "bu" and page.dtype.itemsize <= 2
+    if page.dtype is None or not (integers or page.dtype.kind == "f"):
         raise UnreadableTiffError(f"a TIFF file with values of type {page.dtype}")
     return samples, alpha
 

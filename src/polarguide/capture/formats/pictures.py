@@ -1,11 +1,16 @@
-"""Read picture files: their size by their header, their pixels in RGB order, linear 16-bit codes."""
+"""Read pictures, linear radiance and NumPy arrays. Sizes are checked before memory is allocated."""
 
 from __future__ import annotations
 
 import contextlib
 import functools
 import io
+import math
 import re
+import tokenize
+import zipfile
+import zlib
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -14,7 +19,6 @@ import numpy as np
 import tifffile
 from numpy.typing import NDArray
 
-from polarguide.capture.formats.arrays import BROKEN, array_header, exr_size, hdr_size
 from polarguide.capture.formats.headers import (
     JPEG_IN_TIFF,
     LARGEST_PIXELS,
@@ -32,22 +36,278 @@ from polarguide.capture.formats.headers import (
     tiff_full_scale,
     tiff_size,
 )
-from polarguide.core.errors import PolarguideError, require
-from polarguide.core.files import LARGEST_FILE, read_file
+from polarguide.core.errors import PolarguideError, optional_import, require
+from polarguide.core.files import LARGEST_FILE, in_utf8, read_file
 from polarguide.optics.color import srgb_decode_array
+
+BROKEN = (
+    *(ValueError, TypeError, EOFError, OSError, MemoryError, SyntaxError, RuntimeError),
+    *(tokenize.TokenError, zipfile.BadZipFile, zlib.error),
+)
+"""Errors of decoders for damaged, encrypted or contradictory files. NumPy parses headers as Python code."""
+_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+_LARGEST_ARCHIVE = 1 << 26
+"""Largest uncompressed size of an ``.npz`` file of cameras, in bytes."""
+
+
+def array_size(array: NDArray[Any]) -> str:
+    """Format the shape of an array, such as "3x4"."""
+    return "x".join(map(str, array.shape)) or "a single value"
+
+
+def array_kind(array: NDArray[Any]) -> str:
+    """Describe the shape and type of an array for messages."""
+    return f"an array {array_size(array)} of {array.dtype}"
+
+
+def wrong_camera(where: object, expected: str, found: str) -> PolarguideError:
+    """Return the error of invalid numbers of a camera."""
+    return PolarguideError(where, expected=expected, found=found, remedy="Export the cameras again.")
+
+
+def require_camera(condition: object, where: object, expected: str, found: str) -> None:
+    """Check a condition on the numbers of a camera.
+
+    Raises:
+        PolarguideError: the condition does not hold.
+    """
+    if not condition:
+        raise wrong_camera(where, expected, found)
+
+
+def read_array(path: Path) -> NDArray[Any]:
+    """Read the array of an ``.npy`` file.
+
+    Raises:
+        PolarguideError: the file cannot be read, is truncated or of another kind, or has Python objects.
+    """
+    data = read_file(path)
+    try:
+        return _array(data, "biuf")
+    except BROKEN as error:
+        raise damaged(
+            path,
+            "a complete .npy file of numbers",
+            "an empty file" if not data else f"{len(data)} bytes of another kind",
+        ) from error
+
+
+def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
+    """Read the arrays of an ``.npz`` file of cameras by name; see ``decode_arrays``."""
+    return decode_arrays(path, read_file(path))
+
+
+def decode_arrays(
+    path: Path,
+    data: bytes,
+    names: Collection[str] | None = None,
+    largest: int = _LARGEST_ARCHIVE,
+    *,
+    kinds: str = "biuf",
+    expected: str = "a complete .npz file of numbers",
+    remedy: str = "Copy or export the file again.",
+) -> dict[str, NDArray[Any]]:
+    """Decode the arrays of an ``.npz`` file.
+
+    Args:
+        path: path of the file for messages.
+        data: content of the file.
+        names: names of the requested arrays; missing arrays are ignored. Default: all arrays.
+        largest: largest uncompressed size in bytes.
+        kinds: accepted types of values as NumPy's kind codes.
+        expected, remedy: fields of the error.
+
+    Raises:
+        PolarguideError: the file is damaged or encrypted, or decompresses to more than ``largest`` bytes.
+    """
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            members = {entry.filename.removesuffix(".npy"): entry for entry in archive.infolist()}
+            chosen = members.keys() if names is None else members.keys() & {*names}
+            size = sum(members[name].file_size for name in chosen)
+            if size > largest:
+                raise ValueError(f"an archive that decompresses to {size} bytes")
+            return {
+                name: _array(_member(archive, members[name]), kinds) for name in members if name in chosen
+            }
+    except BROKEN as error:
+        damage = "one that cannot be unpacked" if isinstance(error, zipfile.BadZipFile) else "a damaged one"
+        found = f"{damage} ({error})" if data else "an empty file"
+        raise PolarguideError(path, expected=expected, found=found, remedy=remedy) from error
+
+
+def _member(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> bytes:
+    """Decompress a member of an archive, but no more bytes than its header states.
+
+    Raises:
+        One of ``BROKEN``: the member is damaged, or has a compression without such a bound, which NumPy does not use.
+    """
+    if entry.compress_type not in _METHODS:
+        raise ValueError(f"{entry.filename} has a compression that NumPy does not use")
+    with archive.open(entry) as packed:
+        return packed.read(entry.file_size)
+
+
+def finite_numbers(where: object, array: object, shapes: tuple[tuple[int, ...], ...]) -> NDArray[np.float64]:
+    """Convert an array of finite numbers in one of the shapes to float64.
+
+    Raises:
+        PolarguideError: the array has another shape or type, or values that are not finite.
+    """
+    expected = f"finite numbers in shape {' or '.join('x'.join(map(str, shape)) for shape in shapes)}"
+    try:
+        numbers = np.asarray(array, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise wrong_camera(where, expected, f"something else ({error})") from None
+    require_camera(numbers.shape in shapes, where, expected, array_size(numbers))
+    require_camera(np.isfinite(numbers).all(), where, expected, "values that are not finite")
+    return numbers
+
+
+def array_header(stream: io.BytesIO) -> tuple[tuple[int, ...], np.dtype[Any]]:
+    """Read shape and type from the header of ``.npy``; the stream ends up at the values.
+
+    Raises:
+        One of ``BROKEN``: the header is invalid.
+    """
+    version = np.lib.format.read_magic(stream)
+    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, _, dtype = read(stream)
+    return shape, dtype
+
+
+def _array(data: bytes, kinds: str) -> NDArray[Any]:
+    """Decode ``.npy``. A header that states more values than the file has is refused before memory is allocated.
+
+    ``kinds`` are the accepted types of values as NumPy's kind codes.
+    """
+    stream = io.BytesIO(data)
+    shape, dtype = array_header(stream)
+    size = math.prod((dtype.itemsize, *shape))
+    if dtype.hasobject or dtype.kind not in kinds or size > len(data) - stream.tell():
+        raise ValueError("no complete array of numbers")
+    stream.seek(0)
+    return np.asarray(np.load(stream, allow_pickle=False))
+
+
+_HDR_SIZE = re.compile(rb"[-+]Y (\d{1,9}) [-+]X (\d{1,9})\n")
+_EXR_MAGIC = b"\x76\x2f\x31\x01"
+
+
+def read_radiance(path: Path) -> NDArray[np.float32]:
+    """Read a linear picture. Values may be negative or above 1 and stay as they are.
+
+    Args:
+        path: Radiance ``.hdr``, OpenEXR ``.exr`` (package OpenEXR) or ``.npy`` with [H, W], [H, W, 1] or [H, W, 3].
+
+    Returns:
+        [H, W, 3] float32, RGB. A gray picture becomes three equal channels.
+
+    Raises:
+        PolarguideError: the file cannot be read, is damaged or of another kind, or a package is missing.
+    """
+    suffix = path.suffix.lower()
+    if suffix == ".hdr":
+        pixels = _read_hdr(path)
+    elif suffix == ".exr":
+        pixels = read_exr(path, "RGB", "Y")
+    else:
+        pixels = read_array(path)
+    if pixels.ndim == 2:
+        pixels = pixels[..., None]
+    require(
+        pixels.ndim == 3 and pixels.shape[2] in (1, 3) and 0 not in pixels.shape and pixels.dtype.kind == "f",
+        path,
+        expected="a picture of floating-point numbers with one or three channels",
+        found=array_kind(pixels),
+        remedy="Export the file again.",
+    )
+    with np.errstate(over="ignore"):
+        return np.ascontiguousarray(np.broadcast_to(pixels, (*pixels.shape[:2], 3)), dtype=np.float32)
+
+
+def _read_hdr(path: Path) -> NDArray[Any]:
+    data = read_file(path)
+    found = "an empty file" if not data else "a file of another kind"
+    if (size := hdr_size(data)) is not None:
+        found = f"one that is damaged or cut short (it ends after {len(data)} bytes)"
+        # Compression is at most 127 pixels in two bytes per channel.
+        if 0 < math.prod(size) <= min(LARGEST_PIXELS, 64 * len(data)):
+            level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+            try:
+                pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+                if pixels is not None and pixels.dtype == np.float32 and pixels.ndim == 3:
+                    return pixels[..., 2::-1]
+            except cv2.error:
+                pass
+            finally:
+                cv2.utils.logging.setLogLevel(level)
+    raise damaged(path, "a complete Radiance HDR file", found)
+
+
+def read_exr(path: Path, *choices: Sequence[str]) -> NDArray[Any]:
+    """Read named channels [H, W, C] of an OpenEXR file: the first of the choices that is complete.
+
+    Raises:
+        PolarguideError: the file cannot be read, is damaged or lacks channels, or the package OpenEXR is missing.
+    """
+    data = read_file(path)
+    package = optional_import("OpenEXR", str(path))
+    found = "an empty file" if not data else "one that is damaged, cut short or something else"
+    if data.startswith(_EXR_MAGIC):
+        try:
+            exr_size(path)  # the package allocates all pixels when it opens them
+            with in_utf8(path) as name, package.File(str(name), separate_channels=True) as file:
+                channels = file.channels()
+                for names in choices:
+                    if all(name in channels for name in names):
+                        return np.stack(
+                            [np.asarray(channels[name].pixels, np.float32) for name in names], axis=-1
+                        )
+        except Exception as error:  # any C++ error
+            found = f"one that is damaged or cut short ({str(error).strip().splitlines()[0]})"
+    channels_text = ", or ".join(", ".join(names) for names in choices)
+    raise damaged(path, f"a complete OpenEXR file with channels {channels_text}", found)
+
+
+def hdr_size(data: bytes) -> tuple[int, int] | None:
+    """Return width and height in the header of a Radiance file."""
+    # The size follows the first empty line.
+    size = _HDR_SIZE.match(data, data.find(b"\n\n", 0, 4096) + 2)
+    return None if size is None or not data.startswith(b"#?") else (int(size[2]), int(size[1]))
+
+
+def exr_size(path: Path) -> tuple[int, int]:
+    """Return width and height of the last window in the headers of an OpenEXR file without decoding it.
+
+    Raises:
+        ValueError: a window is larger than any picture.
+        Exception: the file is damaged; several kinds.
+        PolarguideError: the package OpenEXR is missing.
+    """
+    package = optional_import("OpenEXR", str(path))
+    with in_utf8(path) as name, package.File(str(name), header_only=True) as file:
+        windows = [part.header["dataWindow"] for part in file.parts]
+    sizes = [tuple(int(high) - int(low) + 1 for low, high in zip(*window, strict=True)) for window in windows]
+    width, height = max(sizes, key=math.prod)
+    if width * height > LARGEST_PIXELS:
+        raise ValueError(f"{width}x{height} pixels")
+    width, height = sizes[-1]
+    return width, height
+
 
 SUFFIXES = (".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp", ".pgm", ".ppm", ".webp", ".heic", ".heif")
 _LOSSY = (".jpg", ".jpeg", ".webp", ".heic", ".heif")
 TRANSFERS = ("linear", "srgb")
-# Bytes of a pixel: four channels of 16 bits, and as much for what a decoder works on.
+# Bytes per pixel: four channels of 16 bits, and as much for the decoder.
 _DECODED = 16
 
 FULL_CODE = 65535
-"""The code of linear intensity 1."""
+"""Code of linear intensity 1."""
 MOST_MATERIAL = 255
 MATERIAL_REMEDY = (
-    "Write the numbers 0 (unknown), 1 (dielectric) and 2 (metal) themselves, not levels of gray, and others only as "
-    "scene.json lists them under materials."
+    "Write the numbers 0 (unknown), 1 (dielectric) and 2 (metal), not gray levels. Define other numbers in materials "
+    "of scene.json."
 )
 
 
@@ -55,17 +315,17 @@ def decode_picture(path: Path, data: bytes) -> NDArray[Any]:
     """Decode a photograph.
 
     Args:
-        path: where ``data`` came from, for messages.
-        data: the whole file: PNG, JPEG, WebP, HEIC, BMP, PGM, PPM or TIFF of 8 or 16 bits a channel, gray or color;
-            TIFF of floating-point numbers from 0 to 1, which become 16 bits (larger ones are at full scale). Those of
-            fewer bits, as ``stated_full_scale`` says, are brought to the full scale of 8 or 16. Alpha is dropped,
-            an orientation tag is not applied (poses belong to the stored pixels).
+        path: path of the file for messages.
+        data: content of the file: PNG, JPEG, WebP, HEIC, BMP, PGM, PPM or TIFF of 8 or 16 bits a channel, gray or
+            color; TIFF of floating-point numbers from 0 to 1, which become 16 bits (larger numbers become full scale).
+            Fewer bits, see ``stated_full_scale``, are rescaled to 8 or 16. Alpha is dropped. An orientation tag is
+            ignored, because poses refer to stored pixels.
 
     Returns:
-        [H, W, 3] uint8 or uint16, RGB, as stored. A gray picture becomes three equal channels.
+        Stored pixels [H, W, 3] uint8 or uint16, RGB. A gray picture becomes three equal channels.
 
     Raises:
-        PolarguideError: the file is damaged, cut short, of another kind, or transparent somewhere.
+        PolarguideError: the file is damaged, truncated, of another kind, or has transparent pixels.
     """
     pixels = decode_stored(path, data)
     full = stated_full_scale(path, io.BytesIO(data), pixels)
@@ -86,7 +346,7 @@ def decode_picture(path: Path, data: bytes) -> NDArray[Any]:
         path,
         expected="an opaque picture",
         found=f"{clear:.1%} of it transparent",
-        remedy="Save it without transparency; what is not to be looked at belongs into masks/ or invalid/.",
+        remedy="Save it without transparency, and mark unusable pixels in masks/ or invalid/.",
     )
     if pixels.ndim == 2:
         return np.repeat(pixels[..., None], 3, axis=2)
@@ -94,17 +354,16 @@ def decode_picture(path: Path, data: bytes) -> NDArray[Any]:
 
 
 def _codes_of_floats(path: Path, pixels: NDArray[Any]) -> NDArray[np.uint16]:
-    """16-bit codes of intensities from 0 to 1."""
-    if not np.isfinite(pixels).all() or float(np.median(pixels)) > 1.0:
-        raise PolarguideError(
-            path,
-            expected="floating-point values from 0 to 1, where 1 is full scale",
-            found="values that are not finite"
-            if not np.isfinite(pixels).all()
-            else f"up to {float(pixels.max()):g}",
-            remedy="Divide by the value at which the camera saturates, or save 16-bit whole numbers.",
-        )
-    # Half precision ends at 65504, below the largest code.
+    require(
+        np.isfinite(pixels).all() and float(np.median(pixels)) <= 1.0,
+        path,
+        expected="floating-point values from 0 to 1, where 1 is full scale",
+        found="values that are not finite"
+        if not np.isfinite(pixels).all()
+        else f"up to {float(pixels.max()):g}",
+        remedy="Divide by the value at which the camera saturates, or save 16-bit whole numbers.",
+    )
+    # Half precision ends at 65504, below the largest code, so double precision is used.
     return np.rint(np.clip(pixels.astype(np.float64), 0.0, 1.0) * FULL_CODE).astype(np.uint16)
 
 
@@ -112,13 +371,13 @@ def decode_mask(path: Path, data: bytes, *, any_value: bool) -> NDArray[np.bool_
     """Decode a mask picture into [H, W] bool.
 
     Args:
-        path: where ``data`` came from, for messages.
-        data: the whole file.
-        any_value: True where any channel is not zero; otherwise where it reaches half of the picture's
-            maximum, which reads masks of 0 and 1, of 0 and 255, and those with soft edges alike.
+        path: path of the file for messages.
+        data: content of the file.
+        any_value: if True, the mask has the pixels with a nonzero channel; otherwise those of at least half of the
+            maximum, which supports masks of 0 and 1, of 0 and 255, and with soft edges.
 
     Raises:
-        PolarguideError: the file is damaged, cut short, of another kind, or says two masks.
+        PolarguideError: the file is damaged, truncated, of another kind, or has two different masks.
     """
     pixels = decode_stored(path, data)
     gray = pixels if pixels.ndim == 2 else pixels[..., :3].max(axis=2)
@@ -130,86 +389,80 @@ def decode_mask(path: Path, data: bytes, *, any_value: bool) -> NDArray[np.bool_
     return mask
 
 
-# Of a mask's maximum: what compression leaves of black.
-_BLACK = 0.04
-# Share of a picture: areas of one gray in a soft edge are smaller.
-_SMALL_AREA = 1e-3
+_BLACK = 0.04  # largest value of compressed black, relative to the maximum of a mask
+_SMALL_AREA = 1e-3  # share of a picture; areas of one gray in a soft edge are smaller
 
 
 def _require_two_levels(path: Path, gray: NDArray[Any]) -> None:
-    """Refuse labels of several objects, of which the lower half would be taken for background.
+    """Refuse labels of several objects, because those below half of the maximum would count as background.
 
-    They have areas of more than two grays, one of them below half of the maximum. Soft edges change from pixel to
+    Labels are areas of more than two grays, one of them below half of the maximum. Soft edges change from pixel to
     pixel.
 
     Raises:
-        PolarguideError: the picture is one.
+        PolarguideError: the picture has labels.
     """
     levels = gray.astype(np.float32)
     around = np.ones((3, 3), np.uint8)
     flat = cv2.erode(levels, around) == cv2.dilate(levels, around)
     largest = float(levels.max())
     labels = flat & (levels > _BLACK * largest) & (2 * levels < largest)
-    if labels.mean() > _SMALL_AREA and _grays(levels[flat]) > 2:
-        named = ", ".join(f"{level:g}" for level in np.unique(levels[labels])[:4])
+    _, counts = np.unique(levels[flat], return_counts=True)
+    if labels.mean() > _SMALL_AREA and (counts > _SMALL_AREA * counts.sum()).sum() > 2:
+        levels_text = ", ".join(f"{level:g}" for level in np.unique(levels[labels])[:4])
         raise PolarguideError(
             path,
             expected="a mask of two levels, background and object",
-            found=f"areas of {named} beside a maximum of {largest:g}, as labels of several objects have",
+            found=f"areas of {levels_text} and a maximum of {largest:g}, which are labels of several objects",
             remedy="Save it as a gray picture, white where the mask is.",
         )
 
 
-def _grays(levels: NDArray[np.float32]) -> int:
-    """How many grays more than a small share of some pixels have."""
-    return int((np.unique(levels, return_counts=True)[1] > _SMALL_AREA * levels.size).sum())
-
-
 def _require_one_mask(path: Path, pixels: NDArray[Any], mask: NDArray[np.bool_]) -> None:
-    """Refuse a picture that is one mask by its colors, and another by its transparency.
+    """Refuse a picture with different masks in its colors and its transparency.
 
     Raises:
         PolarguideError: colors and transparency contradict one another.
     """
     if pixels.shape[2:] != (4,) or pixels.dtype.kind != "u":
         return
-    solid = pixels[..., 3] > np.iinfo(pixels.dtype).max // 2
-    if not solid.all() and (solid != mask).any():
-        raise PolarguideError(
-            path,
-            expected="a mask without transparency",
-            found=f"{1 - float(solid.mean()):.1%} of it transparent, which says another mask than its colors",
-            remedy="Save it as a gray picture, white where the mask is.",
-        )
+    opaque = pixels[..., 3] > np.iinfo(pixels.dtype).max // 2
+    require(
+        opaque.all() or (opaque == mask).all(),
+        path,
+        expected="a mask without transparency",
+        found=f"{1 - float(opaque.mean()):.1%} of it transparent, in contradiction to its colors",
+        remedy="Save it as a gray picture, white where the mask is.",
+    )
 
 
 def decode_materials(path: Path, data: bytes) -> NDArray[np.uint8]:
-    """Decode a picture of materials into [H, W]: 0 unknown, 1 dielectric, 2 metal, from 3 on what ``scene.json`` says.
+    """Decode a picture of materials into [H, W]: 0 unknown, 1 dielectric, 2 metal, other numbers as in ``scene.json``.
 
     Raises:
-        PolarguideError: the file is damaged, cut short, of another kind, lossy, or has a value beyond 255.
+        PolarguideError: the file is damaged, truncated, of another kind, lossy, or has a value above 255.
     """
     pixels = decode_stored(path, data)
     require(
         not _loses_detail(data),
         path,
-        expected="a lossless picture, such as PNG, which keeps the numbers of materials",
-        found="a compression that changes them (JPEG, HEIC, WebP)",
+        expected="a lossless picture, such as PNG",
+        found="a lossy compression (JPEG, HEIC, WebP), which changes the numbers of materials",
         remedy=f"Save it as PNG. {MATERIAL_REMEDY}",
     )
     gray = pixels if pixels.ndim == 2 else pixels[..., :3].max(axis=2)
-    if int(gray.max(initial=0)) > MOST_MATERIAL:
-        raise PolarguideError(
-            path,
-            expected=f"the numbers of materials, up to {MOST_MATERIAL}",
-            found=f"{int(gray.max())}",
-            remedy=MATERIAL_REMEDY,
-        )
+    require(
+        int(gray.max(initial=0)) <= MOST_MATERIAL,
+        path,
+        expected=f"the numbers of materials, up to {MOST_MATERIAL}",
+        found=f"{int(gray.max())}",
+        remedy=MATERIAL_REMEDY,
+    )
     return np.asarray(gray, np.uint8)
 
 
 def linear_codes(pixels: NDArray[Any], transfer: str) -> NDArray[np.uint16]:
-    """Stored 8- or 16-bit values -> round(65535 * linear intensity), same shape, uint16."""
+    """Convert stored 8- or 16-bit values to round(65535 * linear intensity), same shape, uint16."""
     if pixels.dtype == np.uint16 and transfer == "linear":
         return pixels.astype(np.uint16, copy=False)
     return _table(int(np.iinfo(pixels.dtype).max), transfer)[pixels]
@@ -217,7 +470,7 @@ def linear_codes(pixels: NDArray[Any], transfer: str) -> NDArray[np.uint16]:
 
 @functools.cache
 def _table(full: int, transfer: str) -> NDArray[np.uint16]:
-    """Linear code of every stored value in 0..full."""
+    """Compute the linear code of each stored value in 0..full."""
     levels = np.arange(full + 1) / full
     if transfer == "srgb":
         levels = srgb_decode_array(levels)
@@ -225,17 +478,18 @@ def _table(full: int, transfer: str) -> NDArray[np.uint16]:
 
 
 def decode_stored(path: Path, data: bytes) -> NDArray[Any]:
-    """Decode a picture exactly as stored: [H, W] or [H, W, C] in OpenCV's channel order, any value type.
+    """Decode a picture as stored: [H, W] or [H, W, C] in OpenCV's channel order, any value type.
+
+    TIFF is decoded by tifffile, HEIC by pillow-heif, and other kinds by OpenCV after a check of their structure. Pillow
+    would reduce 16-bit color to 8 bits.
 
     Raises:
-        PolarguideError: the file is damaged, cut short, of another kind, or has samples that are no picture's.
+        PolarguideError: the file is damaged, truncated, of another kind, or has samples of another meaning.
     """
-    # TIFF goes to tifffile and HEIC to pillow-heif, the others to OpenCV once their structure is known to be whole, and
-    # none to Pillow: it would return 8 bits of 16-bit color.
     damage = find_damage(data)
     size = None if damage is not None else declared_size(data)
     if size is not None and size[0] * size[1] > LARGEST_PIXELS:
-        damage = f"one of {size[0]}x{size[1]} pixels, more than any camera takes"
+        damage = f"one of {size[0]}x{size[1]} pixels, more than any camera has"
     if damage is not None:
         raise _unreadable(path, damage)
     kind = picture_kind(data)
@@ -254,41 +508,41 @@ def decode_stored(path: Path, data: bytes) -> NDArray[Any]:
             path,
             expected="one ordinary gray or RGB picture in a TIFF file",
             found=str(error),
-            remedy="Export one gray or RGB picture. If the file holds four angles, save each in a file of its own, "
-            f"such as {path.stem}_0.tif and {path.stem}_45.tif; or give the raw mosaic.",
+            remedy="Export one gray or RGB picture. If the file has four angles, save each in a file of its own, "
+            f"such as {path.stem}_0.tif and {path.stem}_45.tif; or use the raw mosaic.",
         ) from None
-    except Exception as error:  # the libraries raise many kinds of errors for damaged files
+    except Exception as error:  # decoders raise many kinds of errors
         if kind == "HEIF" and isinstance(error, ValueError):
             raise _unreadable(path, str(error)) from None
     if pixels is None:
-        _require_room(path, size)
+        _require_memory(path, size)
         raise _unreadable(path, "one that cannot be decoded")
     # The fourth byte of BMP is padding.
     return np.asarray(pixels[..., :3] if kind == "BMP" and pixels.ndim == 3 else pixels)
 
 
 def _unreadable(path: Path, found: str) -> PolarguideError:
-    """The error for a file of an unsupported kind; ``found``: a noun phrase."""
+    """Return the error of an unsupported file; ``found`` is a noun phrase."""
     if "HEIC" in found or "AVIF" in found:
         return PolarguideError(
             path,
             expected="a PNG, JPEG, WebP, BMP, PGM or TIFF file, or an ordinary HEIC file",
             found=found,
-            remedy="Export it as 16-bit TIFF or JPEG of the highest quality; telephones can be set to JPEG or raw.",
+            remedy="Export it as 16-bit TIFF or JPEG of the highest quality; phones can store JPEG or raw files.",
         )
     return damaged(path, "a complete PNG, JPEG or TIFF file (or WebP, BMP, PGM, HEIC)", found)
 
 
 def is_lossy(path: Path) -> bool:
-    """Whether a file is of a kind that loses detail, and that is sRGB by custom: JPEG, WebP or HEIC, by its suffix."""
+    """Return True for a lossy kind of file, which is sRGB by convention: JPEG, WebP or HEIC, by suffix."""
     return path.suffix.lower() in _LOSSY
 
 
 def _loses_detail(data: bytes) -> bool:
-    """True where the compression of a picture changes its values. The content decides, not the suffix."""
+    """Return True if the compression of a picture changes its values, by content."""
     kind = picture_kind(data)
     if kind == "WebP":
-        chunk = re.search(rb"VP8[ L]", data)  # the name of the first chunk that holds pixels
+        chunk = re.search(rb"VP8[ L]", data)  # first chunk of pixels
         return chunk is not None and chunk[0] == b"VP8 "
     if kind in TIFFS:
         with tifffile.TiffFile(io.BytesIO(data)) as tiff:
@@ -297,15 +551,18 @@ def _loses_detail(data: bytes) -> bool:
 
 
 def stated_full_scale(path: Path, file: BinaryIO, samples: NDArray[Any]) -> int | None:
-    """The full scale that a picture file states below that of its type; None where it does not.
+    """Return the full scale that a picture file states, if it is below that of its type, else None.
 
-    By the maximum of PGM and PPM, bits and MaxSampleValue of TIFF, and the significant bits (sBIT) of PNG.
+    It is the maximum of PGM and PPM, follows from bits or MaxSampleValue of TIFF, or from significant bits (sBIT) of
+    PNG.
 
     Args:
-        path: for messages. file: the file, open, or its bytes. samples: its values as stored.
+        path: path of the file for messages.
+        file: the open file, or its bytes.
+        samples: stored values.
 
     Raises:
-        PolarguideError: a sample exceeds it.
+        PolarguideError: a sample exceeds the full scale.
     """
     head = file.read(HEAD)
     colors = samples[..., :3] if samples.ndim == 3 else samples
@@ -325,7 +582,7 @@ def stated_full_scale(path: Path, file: BinaryIO, samples: NDArray[Any]) -> int 
     if full is not None and int(colors.max(initial=0)) > full:
         raise PolarguideError(
             path,
-            expected=f"values up to {full}, which its header states as the largest",
+            expected=f"values up to {full}, the largest according to its header",
             found=f"{int(colors.max())}",
             remedy="Write the file with the maximum of the camera's values (1023 of 10 bits, 4095 of 12).",
         )
@@ -333,10 +590,10 @@ def stated_full_scale(path: Path, file: BinaryIO, samples: NDArray[Any]) -> int 
 
 
 def _full_of_significant(samples: NDArray[Any], bits: int | None) -> int | None:
-    """Full scale of the samples of a PNG file that states their significant bits.
+    """Return the full scale of a PNG file with significant bits.
 
-    The standard wants them at the top of all bits, and programs of cameras write them at the bottom: then all are
-    small, and low bits are used.
+    By the standard, they are the highest of all bits. Cameras' programs may use the lowest: then all samples are small
+    and low bits are used.
     """
     kind = np.iinfo(samples.dtype)
     if bits is None or not 0 < bits < kind.bits:
@@ -347,13 +604,13 @@ def _full_of_significant(samples: NDArray[Any], bits: int | None) -> int | None:
 
 
 def may_use_fewer_bits(path: Path) -> bool:
-    """Whether the whole numbers of a picture file may fill fewer than the 16 bits that its samples take.
+    """Return True for a 16-bit picture file whose values may have fewer bits.
 
-    Cameras of 10 to 14 bits write PNG and TIFF files of 16 bits, most of which do not say so.
+    Cameras of 10 to 14 bits write PNG and TIFF files of 16 bits, usually without stating the bits.
     """
-    if not path.is_file():  # opening a pipe would wait for its writer; whoever reads the picture refuses it
+    if not path.is_file():  # opening a pipe would block
         return False
-    with contextlib.suppress(Exception), open(path, "rb") as file:  # tifffile raises what it pleases
+    with contextlib.suppress(Exception), open(path, "rb") as file:  # tifffile raises several kinds of errors
         head = file.read(HEAD)
         if picture_kind(head) == "PNG":
             return head[24] == 16 and significant_bits(head) is None
@@ -364,11 +621,11 @@ def may_use_fewer_bits(path: Path) -> bool:
     return False
 
 
-def _require_room(path: Path, size: tuple[int, int] | None) -> None:
-    """Tell a lack of memory from damage, which the decoder does not.
+def _require_memory(path: Path, size: tuple[int, int] | None) -> None:
+    """Distinguish a lack of memory from damage, which look alike to a decoder.
 
     Raises:
-        PolarguideError: a picture of this size, and what its decoder has beside it, cannot be allocated.
+        PolarguideError: there is too little memory for a picture of this size and its decoder.
     """
     width, height = size or (0, 0)
     try:
@@ -384,17 +641,17 @@ def _require_room(path: Path, size: tuple[int, int] | None) -> None:
 
 HEAD = 1 << 20
 LARGEST_PIXEL = 32
-"""Bytes: four channels of 64 bits, as no compression makes them larger."""
+"""Largest size of a pixel in bytes: four channels of 64 bits without compression."""
 ROOM = 1 << 26
-"""Bytes of a picture file beside its pixels: previews, profiles, and what else is written there."""
+"""Largest size of a picture file's metadata in bytes, such as previews and profiles."""
 
 
 def stated_size(path: Path) -> tuple[int, int] | None:
-    """Width and height in the header of a picture or an array; None where there is none to be read.
+    """Return width and height in the header of a picture or an array, or None.
 
-    PNG, JPEG, WebP, HEIC, BMP, PGM, TIFF, Radiance HDR, OpenEXR and ``.npy`` state them; other files do not.
+    Supported are PNG, JPEG, WebP, HEIC, BMP, PGM, TIFF, Radiance HDR, OpenEXR and ``.npy``.
     """
-    if not path.is_file():  # a pipe, a folder, a link to nowhere: whoever reads it says so
+    if not path.is_file():  # reported when the file is read
         return None
     with contextlib.suppress(*BROKEN), open(path, "rb") as file:
         suffix = path.suffix.lower()
@@ -410,17 +667,18 @@ def stated_size(path: Path) -> tuple[int, int] | None:
 
 
 def read_picture(path: Path) -> bytes:
-    """The bytes of a picture file, unless it is far larger than its pixels could be.
+    """Read a picture file, unless it is far larger than its pixels could be.
 
     Raises:
-        PolarguideError: that, or it cannot be read.
+        PolarguideError: the file is too large or cannot be read.
     """
     size = stated_size(path)
-    largest = ROOM if size is None else min(LARGEST_FILE, ROOM + LARGEST_PIXEL * size[0] * size[1])
-    return read_file(path, largest=largest)
+    return read_file(
+        path, largest=ROOM if size is None else min(LARGEST_FILE, ROOM + LARGEST_PIXEL * size[0] * size[1])
+    )
 
 
 def _array_size(head: bytes) -> tuple[int, int] | None:
-    """Of an ``.npy`` file of two or more axes, rows first."""
+    """Return width and height of an ``.npy`` file of two or more axes, rows first."""
     shape, _ = array_header(io.BytesIO(head))
     return (int(shape[1]), int(shape[0])) if len(shape) > 1 else None

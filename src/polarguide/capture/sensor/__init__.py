@@ -1,1 +1,1 @@
-"""Division-of-focal-plane polarization sensors: from raw mosaics to intensities behind four polarizer angles."""
+"""Polarization sensors with a filter on each pixel: from raw mosaics to intensities at four polarizer angles."""

@@ -1,9 +1,9 @@
-"""Analyzer vectors of a polarization sensor, and the correction of what it measures with them.
+"""Analyzer vectors of a polarization sensor, and the correction of intensities with them.
 
 A pixel behind a polarizer measures ``I = a . (S0, S1, S2)`` of the linear Stokes vector; ``a`` is its analyzer vector,
-``(1, cos 2p, sin 2p) / 2`` for an ideal polarizer at the angle p. ``polarguide calibrate`` estimates the vectors,
-``write_analyzers`` and ``read_analyzers`` store them. ``AnalyzerCalibration.apply`` gives the intensities that ideal
-polarizers would have measured (the superpixel calibration of Powell and Gruev, Optics Express 21(18), 2013).
+``(1, cos 2p, sin 2p) / 2`` for an ideal polarizer at the angle p. ``polarguide calibrate`` estimates the vectors.
+``AnalyzerCalibration.apply`` computes the intensities of ideal polarizers (the superpixel calibration of Powell and
+Gruev, Optics Express 21(18), 2013).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
 from polarguide.capture.sensor.pattern import SENSORS, Pattern, sensor_pattern
-from polarguide.core.errors import PolarguideError
+from polarguide.core.errors import PolarguideError, require
 from polarguide.core.files import in_utf8, require_file, write_whole
 from polarguide.core.records import decode
 from polarguide.geometry.polarizer import ANGLES
@@ -30,13 +30,14 @@ Array = NDArray[np.float32]
 
 
 def correction_matrices(analyzers: list[Array], nominal: NDArray[Any]) -> Array:
-    """Matrices from measured samples of a cell to those of ideal polarizers.
+    """Compute the matrices from measured samples of a cell to those of ideal polarizers.
 
     ``C = W pinv(A) + n m^T``: A [4, 3] are the analyzer vectors, W those of ideal polarizers, n and m the unit vectors
-    perpendicular to the columns of W and A. C A = W, and C is the identity where A is W.
+    perpendicular to the columns of W and A. C A = W, and C is the identity if A is W.
 
     Args:
-        analyzers: four of [..., 3], the vectors of the samples of a cell. nominal: their nominal angles in degrees.
+        analyzers: analyzer vectors of the four samples of a cell, [..., 3] each.
+        nominal: nominal angles of the samples in degrees.
 
     Returns:
         [4, 4, ...] float32.
@@ -46,23 +47,15 @@ def correction_matrices(analyzers: list[Array], nominal: NDArray[Any]) -> Array:
     def dot(x: list[Any], y: list[Any]) -> Any:
         return x[0] * y[0] + x[1] * y[1] + x[2] * y[2] + x[3] * y[3]
 
-    uu = dot(u, u)
-    uv = dot(u, v)
-    uw = dot(u, w)
-    vv = dot(v, v)
-    vw = dot(v, w)
-    ww = dot(w, w)
-    # The inverse of A^T A by its adjugate: millions of 3x3 matrices, for which LAPACK's calls would take seconds.
-    a00 = vv * ww - vw * vw
-    a01 = uw * vw - uv * ww
-    a02 = uv * vw - uw * vv
-    a11 = uu * ww - uw * uw
-    a12 = uv * uw - uu * vw
-    a22 = uu * vv - uv * uv
-    scale = 1 / (uu * a00 + uv * a01 + uw * a02)
+    gram = [[dot(x, y) for y in (u, v, w)] for x in (u, v, w)]
+    # The adjugate inverts A^T A, because LAPACK's calls would take seconds for millions of 3x3 matrices.
+    adjugate = [
+        [gram[i - 2][j - 2] * gram[i - 1][j - 1] - gram[i - 2][j - 1] * gram[i - 1][j - 2] for j in range(3)]
+        for i in range(3)
+    ]
+    scale = 1 / (gram[0][0] * adjugate[0][0] + gram[0][1] * adjugate[0][1] + gram[0][2] * adjugate[0][2])
     inverse = [
-        [(r[0] * u[j] + r[1] * v[j] + r[2] * w[j]) * scale for j in range(4)]
-        for r in ((a00, a01, a02), (a01, a11, a12), (a02, a12, a22))
+        [(row[0] * u[j] + row[1] * v[j] + row[2] * w[j]) * scale for j in range(4)] for row in adjugate
     ]
     left = []
     for j in range(4):
@@ -77,50 +70,57 @@ def correction_matrices(analyzers: list[Array], nominal: NDArray[Any]) -> Array:
     sine = [{45: 1.0, 135: -1.0}.get(int(angle), 0.0) for angle in nominal]
     rows = []
     for k in range(4):
-        turned = inverse[1] if cosine[k] else inverse[2]
+        component = inverse[1] if cosine[k] else inverse[2]
         sign = cosine[k] + sine[k]
-        rows.append([(inverse[0][j] + sign * turned[j]) / 2 + rest[k] * left[j] for j in range(4)])
+        rows.append([(inverse[0][j] + sign * component[j]) / 2 + rest[k] * left[j] for j in range(4)])
     return np.asarray(rows, np.float32)
 
 
 CALIBRATED_IMBALANCE = 0.01
-"""Of the pair sums of a calibrated sensor; more is a sign of another camera's calibration."""
+"""Largest imbalance of the pair sums of a calibrated sensor; more is a sign of another camera's calibration."""
 
 
 def imbalance_notes(ratio: float | None) -> list[str]:
-    """Notes for the user on the ratio of the pair sums after calibration."""
-    notes = [] if ratio is None else [f"With the calibration, I0 + I90 is {ratio - 1:+.2%} off I45 + I135."]
+    """Return notes for the user on the ratio of the pair sums after calibration."""
+    notes = (
+        []
+        if ratio is None
+        else [f"With the calibration, I0 + I90 differs from I45 + I135 by {ratio - 1:+.2%}."]
+    )
     if ratio is not None and abs(ratio - 1) > CALIBRATED_IMBALANCE:
-        notes.append("That is more than a calibration of this camera leaves: is it one of another?")
+        notes.append(
+            "This is too much for a calibration of this camera: check whether it is of another camera."
+        )
     return notes
 
 
 FARTHEST_ANGLE = np.radians(20.0)
-"""Of a polarizer from the angle that its position has by design."""
+"""Largest deviation of a polarizer from its nominal angle, in radians."""
 LEAST_DIATTENUATION = 0.3
-"""Of a pixel's polarizer; below it, its angle and the correction mean nothing. (Extinction ratio 1.9.)"""
-# Rows of cells whose matrices are made at once: their parts then stay in the processor's cache.
-_AT_ONCE = 16
+"""Smallest diattenuation of a pixel's polarizer with a meaningful angle (extinction ratio 1.9)."""
+# Number of rows of cells per batch of matrices, which must fit into the processor's cache.
+_BATCH = 16
 
 Reference = Literal["angles", "mean"]
 
 
 @dataclass(frozen=True, eq=False)
 class AnalyzerCalibration:
-    """Analyzer vectors over a sensor, or a region of it.
+    """Analyzer vectors of a sensor, or of a region of it.
 
     Attributes:
-        sensor: its name, a key of ``SENSORS``.
-        lens: the user's name of the lens; "" without one.
-        offset: column and row of the sensor at which the region starts. size: width and height of the region.
-        block: side in pixels of the blocks that share vectors; the pattern's period where each pixel has its own.
+        sensor: name of the sensor, a key of ``SENSORS``.
+        lens: the user's name of the lens, or "".
+        offset: column and row of the sensor at which the region starts.
+        size: width and height of the region.
+        block: side in pixels of the blocks that share vectors; the period of the pattern for a vector per pixel.
         vectors: [rows, columns, P, P, 3] float32 for a pattern of the period P: the vector of a pixel in column x and
             row y of the sensor is ``vectors[y // block - offset_y // block, x // block - offset_x // block, y % P,
-            x % P]``. Their scale: the mean of the first components around a pixel, of its color, is 1/2.
-        reference: where the zero of the angles comes from: "angles" of the polarizer as given, or "mean": the mean
-            deviation of the positions from their nominal angles is zero.
-        polarizer_extinction: of the polarizer before the light, as given; None where it was taken as ideal.
-        sha256: checksum of all of these.
+            x % P]``. Scale: the mean of the first components around a pixel, of its color, is 1/2.
+        reference: origin of the angles: "angles" of the polarizer as specified, or "mean", for which the mean deviation
+            of the positions from their nominal angles is zero.
+        polarizer_extinction: extinction ratio of the polarizer in front of the light; None for an ideal one.
+        sha256: checksum of all other attributes.
     """
 
     sensor: str
@@ -138,74 +138,75 @@ class AnalyzerCalibration:
 
     @property
     def pattern(self) -> Pattern:
-        """The pattern of the whole sensor."""
+        """Pattern of the whole sensor."""
         return sensor_pattern(self.sensor)
 
     def require_sensor(self, sensor: str | None, where: object) -> None:
         """Refuse a calibration of another sensor.
 
         Args:
-            sensor: the sensor of what is to be corrected; None where nobody knows. where: for messages.
+            sensor: sensor of the pictures, None if unknown.
+            where: place for messages.
 
         Raises:
             PolarguideError: the calibration is of another sensor.
         """
-        if sensor is not None and sensor != self.sensor:
-            raise PolarguideError(
-                where,
-                expected=f"a calibration of the sensor {sensor}",
-                found=f"the calibration of {self.sensor}",
-                remedy="Give the calibration of this camera, or the --sensor that it was made with.",
-            )
+        require(
+            sensor is None or sensor == self.sensor,
+            where,
+            expected=f"a calibration of the sensor {sensor}",
+            found=f"the calibration of {self.sensor}",
+            remedy="Use the calibration of this camera, or the --sensor of the calibration.",
+        )
 
     def require_region(self, offset: tuple[int, int], size: tuple[int, int], where: object) -> None:
-        """Refuse a region that the calibration does not hold.
+        """Refuse a region outside the calibrated one.
 
         Args:
-            offset, size: those of the region, in columns and rows of the sensor. where: for messages.
+            offset, size: offset and size of the region, in columns and rows of the sensor.
+            where: place for messages.
 
         Raises:
             PolarguideError: the region is not inside the calibrated one.
         """
         inside = all(
-            mine <= start and start + length <= mine + whole
-            for mine, whole, start, length in zip(self.offset, self.size, offset, size, strict=True)
+            low <= start and start + length <= low + side
+            for low, side, start, length in zip(self.offset, self.size, offset, size, strict=True)
         )
-        if not inside:
-            raise PolarguideError(
-                where,
-                expected=f"a calibration that covers {_region(offset, size)}",
-                found=f"the calibration of {_region(self.offset, self.size)}",
-                remedy="Calibrate with the region of these files; --offset-x and --offset-y say where it starts.",
-            )
+        require(
+            inside,
+            where,
+            expected=f"a calibration that covers {_region(offset, size)}",
+            found=f"the calibration of {_region(self.offset, self.size)}",
+            remedy="Calibrate with the region of these files; --offset-x and --offset-y specify its start.",
+        )
 
     def record(self) -> dict[str, str]:
-        """The calibration's entry in ``scene.json``."""
+        """Return the calibration's entry in ``scene.json``."""
         return {"sensor": self.sensor, "lens": self.lens, "sha256": self.sha256}
 
     def apply(
         self, values: Array, *, offset: tuple[int, int] | None = None, scale: int | None = None
     ) -> Array:
-        """Intensities that ideal polarizers would have measured.
+        """Compute the intensities that ideal polarizers would measure.
 
-        Of the four samples I of a cell with the analyzer vectors A [4, 3], ``pinv(A) I`` is the Stokes vector, and the
-        result are its intensities behind ideal polarizers. The one part of I that no Stokes vector explains (for an
-        ideal sensor, I0 - I45 + I90 - I135) is kept, so that the samples of an ideal sensor do not change and the
-        noise can still be told from it. Samples have to be linear and without black level; they may be scaled.
+        For the four samples I of a cell with the analyzer vectors A [4, 3], ``pinv(A) I`` is the Stokes vector. The
+        result are its intensities behind ideal polarizers. The component of I that no Stokes vector explains (for an
+        ideal sensor, I0 - I45 + I90 - I135) does not change. So samples of an ideal sensor stay as they are, and noise
+        remains measurable. Samples must be linear without black level; any scale is possible.
 
         Args:
             values: a mosaic [H, W]; or four intensities at 0, 45, 90 and 135 degrees, [4, h, w] or [4, h, w, C] with
-                1 or 3 channels, as developed from one at its size, half or a quarter of it.
-            offset: column and row of the sensor at which the mosaic starts; that of the calibration if None.
-            scale: pixels of the sensor that became one of four intensities, each way (1, 2 or 4); if None, as the
-                size says.
+                1 or 3 channels. Intensities have the size of the mosaic, half or a quarter of it.
+            offset: column and row of the sensor at which the mosaic starts; default: that of the calibration.
+            scale: sensor pixels per pixel of the intensities, in each direction (1, 2 or 4); default: by the size.
 
         Returns:
-            float32 in the shape of ``values``. Rows and columns that fill no cell are as they were.
+            float32 in the shape of ``values``. Rows and columns of incomplete cells do not change.
 
         Raises:
-            PolarguideError: the calibration is of another size.
-            ValueError: another shape.
+            PolarguideError: the calibration has another size.
+            ValueError: the shape is invalid.
         """
         values = np.asarray(values, np.float32)
         start = self.offset if offset is None else offset
@@ -216,19 +217,20 @@ class AnalyzerCalibration:
         return self._four(values, start, scale)
 
     def correction(self, offset: tuple[int, int], size: tuple[int, int]) -> Array:
-        """The matrix of each cell of a region.
+        """Return the matrix of each cell of a region.
 
         Args:
-            offset: column and row of the sensor, at the start of a cell. size: width and height in pixels, even.
+            offset: column and row of the sensor at the start of a cell.
+            size: width and height in pixels, even.
 
         Returns:
-            [4, 4, height / 2, width / 2]: the matrix from the samples of a cell, by rows, to the corrected ones.
+            Matrices from the samples of a cell in row order to the corrected samples, [4, 4, height / 2, width / 2].
         """
         matrices, rows, columns = self._coarse(offset, size)
         return np.ascontiguousarray(matrices[:, :, rows[:, None], columns])
 
     def peak(self, offset: tuple[int, int], size: tuple[int, int]) -> float:
-        """The largest intensity that comes out where no sample of a region exceeds 1."""
+        """Return the largest corrected intensity for samples up to 1 in a region."""
         matrices, _, _ = self._coarse(offset, size)
         return float(np.maximum(matrices, 0).sum(axis=1).max())
 
@@ -272,16 +274,17 @@ class AnalyzerCalibration:
     def of_pictures(
         self, shape: tuple[int, ...], *, offset: tuple[int, int] | None = None, scale: int | None = None
     ) -> Array:
-        """The matrix of each pixel of pictures that were developed from mosaics; arguments as in ``apply``.
+        """Return the matrix of each pixel of developed pictures.
 
         Args:
             shape: height and width of the pictures.
+            offset, scale: arguments of ``apply``.
 
         Returns:
-            What ``correction_of_angles`` gives.
+            Matrices of ``correction_of_angles``.
 
         Raises:
-            PolarguideError: the calibration is of another size.
+            PolarguideError: the calibration has another size.
         """
         offset = self.offset if offset is None else offset
         left, top = self.pattern.shifted(*offset).cell_corner()
@@ -289,26 +292,27 @@ class AnalyzerCalibration:
         columns, rows = ((self.offset[axis] + self.size[axis] - start[axis]) // 2 * 2 for axis in (0, 1))
         height, width = shape
         fitting = [step for step in (1, 2, 4) if (rows // step, columns // step) == (height, width)]
-        if scale is None and not fitting:
-            raise PolarguideError(
-                "calibration",
-                expected=f"the calibration of a sensor with pictures of {width}x{height} pixels",
-                found=f"the calibration of {_region(self.offset, self.size)}",
-                remedy="Give the calibration of this camera, made with the region of these pictures.",
-            )
+        require(
+            scale is not None or fitting,
+            "calibration",
+            expected=f"the calibration of a sensor with pictures of {width}x{height} pixels",
+            found=f"the calibration of {_region(self.offset, self.size)}",
+            remedy="Use the calibration of this camera, made with the region of these pictures.",
+        )
         step = fitting[0] if scale is None else scale
         self.require_region(start, (width * step, height * step), "calibration")
         return self.correction_of_angles(start, (width * step, height * step), step)
 
     def correction_of_angles(self, offset: tuple[int, int], size: tuple[int, int], scale: int) -> Array:
-        """The matrix of each pixel of four intensities at 0, 45, 90 and 135 degrees.
+        """Return the matrix of each pixel of four intensities at 0, 45, 90 and 135 degrees.
 
         Args:
-            offset: column and row of the sensor, at the start of a cell. size: width and height in pixels of the
-                sensor. scale: of these, each way, that are one pixel of the intensities: 1, 2 or 4.
+            offset: column and row of the sensor at the start of a cell.
+            size: width and height in pixels of the sensor.
+            scale: sensor pixels per pixel of the intensities, in each direction: 1, 2 or 4.
 
         Returns:
-            [4, 4, h, w], or [4, 4, h, w, 3] for a color sensor, whose colors have analyzers of their own.
+            [4, 4, h, w], or [4, 4, h, w, 3] for a color sensor, whose colors have different analyzers.
         """
         pattern = self.pattern.shifted(*offset)
         height = size[1] // scale
@@ -320,8 +324,9 @@ class AnalyzerCalibration:
         if pattern.colors is None:
             planes = [_repeated(cells, 2 // scale)]
             if scale == 4:
-                parts = [cells[..., r::2, c::2] for r, c in np.ndindex(2, 2)]
-                planes = [np.mean(parts, axis=0, dtype=np.float32)]
+                planes = [
+                    np.mean([cells[..., r::2, c::2] for r, c in np.ndindex(2, 2)], axis=0, dtype=np.float32)
+                ]
         else:
             corners = [(row, column) for row, column in np.ndindex(2, 2)]
             planes = []
@@ -335,39 +340,39 @@ class AnalyzerCalibration:
     def _coarse(
         self, offset: tuple[int, int], size: tuple[int, int]
     ) -> tuple[Array, NDArray[np.intp], NDArray[np.intp]]:
-        """Matrices [4, 4, R, C] of the different cells, and which of these each row and column of cells has."""
+        """Return the distinct matrices [4, 4, R, C], and their indices for each row and column of cells."""
         key = (offset, size)
         grid = self._matrices.get(key)
         if grid is None:
-            rows, columns = (self._places(axis, offset[1 - axis], size[1 - axis]) for axis in (0, 1))
-            y, which_row = rows
-            x, which_column = columns
+            (y, row_index), (x, column_index) = (
+                self._places(axis, offset[1 - axis], size[1 - axis]) for axis in (0, 1)
+            )
             nominal = self.pattern.shifted(*offset).angles[:2, :2].ravel()
             matrices = np.empty((4, 4, y.shape[1], x.shape[1]), np.float32)
-            for first in range(0, y.shape[1], _AT_ONCE):
-                part = y[:, first : first + _AT_ONCE, None]
+            for first in range(0, y.shape[1], _BATCH):
+                part = y[:, first : first + _BATCH, None]
                 analyzers = [
                     self.vectors[part[2 * r], x[2 * c], part[2 * r + 1], x[2 * c + 1]]
                     for r, c in np.ndindex(2, 2)
                 ]
-                matrices[:, :, first : first + _AT_ONCE] = correction_matrices(analyzers, nominal)
-            grid = matrices, which_row, which_column
+                matrices[:, :, first : first + _BATCH] = correction_matrices(analyzers, nominal)
+            grid = matrices, row_index, column_index
             self._matrices.clear()
             self._matrices[key] = grid
         return grid
 
     def _places(self, axis: int, start: int, length: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """The different rows (axis 0) or columns (1) of cells, and which of them each one is.
+        """Return the distinct rows (axis 0) or columns (1) of cells, and the index of each row or column.
 
         Returns:
-            [4, R]: block and place in the pattern of a cell's first row, and of its second; and [length / 2].
+            [4, R]: block and place in the pattern of a cell's first row, and of its second; and indices [length / 2].
         """
         period = self.pattern.period
         last = self.vectors.shape[axis] - 1
         first = start + 2 * np.arange(length // 2)
         described = []
         for place in (first, first + 1):
-            # A cell beyond the edge, which completes a superpixel, takes the vectors of the last block.
+            # A cell beyond the edge, which completes a superpixel, has the vectors of the last block.
             block = place // self.block - self.offset[1 - axis] // self.block
             described += [np.minimum(block, last), place % period]
         unique, inverse = np.unique(np.stack(described), axis=1, return_inverse=True)
@@ -375,14 +380,14 @@ class AnalyzerCalibration:
 
 
 def spread_to_cells(bad: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Unusable samples [H, W] of a mosaic that starts with a cell, spread to all of their cells: these were mixed."""
+    """Spread a mask of unusable samples [H, W] of a mosaic to all of their cells, because correction mixes cells."""
     height, width = bad.shape
     cells = bad.reshape(height // 2, 2, width // 2, 2).any(axis=(1, 3))
     return np.repeat(np.repeat(cells, 2, axis=0), 2, axis=1)
 
 
 def grid_shape(offset: tuple[int, int], size: tuple[int, int], block: int) -> tuple[int, int]:
-    """Rows and columns of blocks that a region touches; blocks count from the corner of the sensor."""
+    """Return the number of rows and columns of blocks in a region; blocks start at the corner of the sensor."""
     rows, columns = (
         (start + length - 1) // block - start // block + 1
         for start, length in zip(offset[::-1], size[::-1], strict=True)
@@ -391,7 +396,7 @@ def grid_shape(offset: tuple[int, int], size: tuple[int, int], block: int) -> tu
 
 
 def _region(offset: tuple[int, int], size: tuple[int, int]) -> str:
-    place = f" from column {offset[0]}, row {offset[1]} on" if any(offset) else ""
+    place = f" from column {offset[0]}, row {offset[1]}" if any(offset) else ""
     return f"{size[0]}x{size[1]} pixels{place}"
 
 
@@ -403,7 +408,7 @@ FORMAT = "polarguide-analyzers"
 VERSION = 1
 SUFFIX = ".safetensors"
 MOST_THROUGHPUT = 1e3
-_LONGEST_HEADER = 100_000_000  # bytes, by safetensors' format; text in their place is a larger number
+_LONGEST_HEADER = 100_000_000  # limit of safetensors in bytes; text gives a larger number
 _ENTRY = "polarguide"
 _TENSOR = "vectors"
 _REMEDY = "Calibrate again (polarguide calibrate), or copy the file again."
@@ -413,7 +418,7 @@ _NotNegative = Annotated[int, msgspec.Meta(ge=0, le=1 << 20)]
 
 
 class _Metadata(msgspec.Struct, forbid_unknown_fields=True):
-    """The one entry of metadata of the file."""
+    """Metadata of the file, stored as one entry."""
 
     format: str
     version: int
@@ -434,9 +439,9 @@ UNITS = "intensity per Stokes component, (S0, S1, S2); an ideal polarizer has (1
 
 
 def is_analyzer_file(path: Path) -> bool:
-    """Return True if a file looks like a file of analyzers, and False for JSON or an unreadable file."""
+    """Return True if a file is likely a file of analyzers, and False for JSON or an unreadable file."""
     try:
-        if not path.is_file():  # opening a pipe would wait for somebody who writes to it
+        if not path.is_file():  # opening a pipe would block
             return False
         with path.open("rb") as file:
             start = file.read(64)
@@ -448,7 +453,7 @@ def is_analyzer_file(path: Path) -> bool:
 
 
 def write_analyzers(path: Path, calibration: AnalyzerCalibration) -> str:
-    """Write the file of a calibration, which is the same bytes for the same content; returns the checksum.
+    """Write the file of a calibration and return its checksum. Equal content gives equal bytes.
 
     Raises:
         PolarguideError: the file cannot be written.
@@ -459,17 +464,22 @@ def write_analyzers(path: Path, calibration: AnalyzerCalibration) -> str:
         calibration.block, calibration.reference, calibration.polarizer_extinction, UNITS, "",
     )  # fmt: skip
     metadata.sha256 = _checksum(metadata, vectors)
-    # One entry: safetensors writes several in any order.
-    text = json.dumps(msgspec.to_builtins(metadata), ensure_ascii=False)
-    write_whole(path, save({_TENSOR: vectors}, metadata={_ENTRY: text}))
+    # A single entry, because safetensors writes several entries in any order.
+    write_whole(
+        path,
+        save(
+            {_TENSOR: vectors},
+            metadata={_ENTRY: json.dumps(msgspec.to_builtins(metadata), ensure_ascii=False)},
+        ),
+    )
     return metadata.sha256
 
 
 def read_analyzers(path: Path) -> AnalyzerCalibration:
-    """Read the file that ``polarguide calibrate`` wrote.
+    """Read a file of ``polarguide calibrate``.
 
     Raises:
-        PolarguideError: the file cannot be read, is cut short, damaged, or of another kind or version.
+        PolarguideError: the file cannot be read, is truncated, damaged, or of another kind or version.
     """
     require_file(path, expected="a calibration of polarguide calibrate", remedy=_REMEDY)
     try:
@@ -481,15 +491,18 @@ def read_analyzers(path: Path) -> AnalyzerCalibration:
     if _ENTRY not in entries or vectors is None:
         raise _damaged(path, "another safetensors file")
     metadata = decode(entries[_ENTRY].encode(), _Metadata, path, remedy=_REMEDY)
-    if metadata.format != FORMAT or metadata.version != VERSION:
-        raise _damaged(path, f"{metadata.format}, version {metadata.version}")
-    if _checksum(metadata, vectors) != metadata.sha256:
-        raise PolarguideError(
-            path,
-            expected=f"content with the checksum {metadata.sha256[:16]}...",
-            found="other content: the file is damaged, or was changed",
-            remedy=_REMEDY,
-        )
+    _require(
+        metadata.format == FORMAT and metadata.version == VERSION,
+        path,
+        f"{metadata.format}, version {metadata.version}",
+    )
+    require(
+        _checksum(metadata, vectors) == metadata.sha256,
+        path,
+        expected=f"content with the checksum {metadata.sha256[:16]}...",
+        found="other content: the file is damaged or was changed",
+        remedy=_REMEDY,
+    )
     calibration = AnalyzerCalibration(
         metadata.sensor, metadata.lens, (metadata.offset_x, metadata.offset_y), (metadata.width, metadata.height),
         metadata.block, vectors, metadata.reference, metadata.polarizer_extinction, metadata.sha256,
@@ -499,40 +512,52 @@ def read_analyzers(path: Path) -> AnalyzerCalibration:
 
 
 def _require_sound(path: Path, calibration: AnalyzerCalibration) -> None:
-    """Refuse content that fits its checksum and still makes no sense.
+    """Refuse invalid content with a valid checksum.
 
     Raises:
-        PolarguideError: an unknown sensor, vectors of another shape, or that no polarizer has.
+        PolarguideError: the sensor is unknown, or the vectors have another shape or belong to no polarizer.
     """
-    if calibration.sensor not in SENSORS:
-        raise _damaged(path, f"one of the sensor {calibration.sensor!r}, which is unknown")
+    _require(calibration.sensor in SENSORS, path, f"the unknown sensor {calibration.sensor!r}")
     period = calibration.pattern.period
     shape = (*grid_shape(calibration.offset, calibration.size, calibration.block), period, period, 3)
-    if (
-        calibration.block % period
-        or calibration.vectors.shape != shape
-        or calibration.vectors.dtype != np.float32
-    ):
-        raise _damaged(
-            path,
-            f"vectors {list(calibration.vectors.shape)} of {calibration.vectors.dtype} instead of {list(shape)}",
-        )
+    _require(
+        calibration.block % period == 0
+        and calibration.vectors.shape == shape
+        and calibration.vectors.dtype == np.float32,
+        path,
+        f"vectors {list(calibration.vectors.shape)} of {calibration.vectors.dtype} instead of {list(shape)}",
+    )
     gain = calibration.vectors[..., 0]
-    if not (np.isfinite(calibration.vectors).all() and (gain > 0).all()):
-        raise _damaged(path, "vectors that are not finite, or have no throughput")
-    if gain.min() < 1 / MOST_THROUGHPUT or gain.max() > MOST_THROUGHPUT:
-        raise _damaged(
-            path, f"throughputs of {gain.min():g} to {gain.max():g}, whose mean is 1/2 in such a file"
-        )
-    if (
-        np.hypot(calibration.vectors[..., 1], calibration.vectors[..., 2]) < LEAST_DIATTENUATION * gain
-    ).any():
-        raise _damaged(path, "vectors of pixels that hardly polarize")
+    _require(
+        np.isfinite(calibration.vectors).all() and (gain > 0).all(),
+        path,
+        "vectors that are not finite or have no throughput",
+    )
+    _require(
+        gain.min() >= 1 / MOST_THROUGHPUT and gain.max() <= MOST_THROUGHPUT,
+        path,
+        f"throughputs of {gain.min():g} to {gain.max():g} instead of a mean of 1/2",
+    )
+    _require(
+        (
+            np.hypot(calibration.vectors[..., 1], calibration.vectors[..., 2]) >= LEAST_DIATTENUATION * gain
+        ).all(),
+        path,
+        "vectors of pixels that hardly polarize",
+    )
     nominal = 2 * np.radians(calibration.pattern.angles)
     angles = np.arctan2(calibration.vectors[..., 2], calibration.vectors[..., 1])
-    # Four that are alike could not be solved for light.
-    if (np.cos(angles - nominal) < np.cos(2 * FARTHEST_ANGLE)).any():
-        raise _damaged(path, "vectors of polarizers far from the sensor's angles")
+    # Equal angles would not determine the light.
+    _require(
+        (np.cos(angles - nominal) >= np.cos(2 * FARTHEST_ANGLE)).all(),
+        path,
+        "vectors of polarizers far from the sensor's angles",
+    )
+
+
+def _require(condition: object, path: Path, found: str) -> None:
+    if not condition:
+        raise _damaged(path, found)
 
 
 def _damaged(path: Path, found: str) -> PolarguideError:

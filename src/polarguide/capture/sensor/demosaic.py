@@ -1,4 +1,4 @@
-"""Demosaic polarization mosaics, at full, half or quarter resolution; find defective samples (hot and dead pixels)."""
+"""Demosaic polarization mosaics at full, half or quarter resolution, and detect defective samples."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Array = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
 GUIDED_RADIUS = 3
-"""Pixels around a sample that its value reaches in either guided interpolation: 2 for the guide, 1 beyond."""
+"""Largest distance in pixels at which a sample has influence in a guided interpolation: 2 for the guide, 1 beyond."""
 
 _TENT = np.outer([1, 2, 1], [1, 2, 1]).astype(np.float32)
 _HALVES = np.array([0.5, 1, 0.5], np.float32)
@@ -26,14 +26,14 @@ _SOFT_SQUARE = np.float32(1e-4)
 
 
 def interpolate_bilinear(values: Array, known: Mask) -> Array:
-    """Bilinear interpolation of samples that are known at every second pixel, or in a checkerboard.
+    """Interpolate samples at every second pixel or in a checkerboard bilinearly.
 
     Args:
-        values: [H, W]; those where ``known`` is False are not looked at.
-        known: [H, W].
+        values: samples [H, W]; ignored where ``known`` is False.
+        known: mask of the samples, [H, W].
 
     Returns:
-        [H, W], the samples themselves where they are known.
+        [H, W]; known samples do not change.
     """
     weight = _filtered(known.astype(np.float32))
     return np.where(known, values, _filtered(np.where(known, values, np.float32(0))) / weight)
@@ -43,16 +43,18 @@ def bilinear_cells(mosaic: Array, row: int, column: int, out: Array) -> None:
     """Interpolate the samples at every second row from ``row`` and every second column from ``column``.
 
     Args:
-        mosaic: [H, W], H and W even. row, column: 0 or 1. out: [H, W], takes the result.
+        mosaic: mosaic [H, W], H and W even.
+        row, column: 0 or 1.
+        out: output [H, W].
     """
     spread = np.zeros_like(mosaic)
     spread[row::2, column::2] = mosaic[row::2, column::2]
-    # Reflected about the outermost pixel the lattice goes on, and the weights add up to 1 everywhere.
+    # Reflection about the outermost pixel continues the lattice, so that weights add up to 1.
     cv2.sepFilter2D(spread, -1, _HALVES, _HALVES, dst=out, borderType=cv2.BORDER_REFLECT_101)
 
 
 def guided_color(bayer: Array, colors: NDArray[np.int64]) -> Array:
-    """Bayer picture [H, W] with ``colors`` 0, 1, 2 (R, G, B) at its pixels -> [H, W, 3]."""
+    """Interpolate a Bayer picture [H, W] with ``colors`` 0, 1, 2 (R, G, B) at its pixels to [H, W, 3]."""
     at = _neighbors(bayer)
     center = 2 * bayer
     bend_x = center - at(0, -2) - at(0, 2)
@@ -67,14 +69,14 @@ def guided_color(bayer: Array, colors: NDArray[np.int64]) -> Array:
 
 
 def _half_s0(mosaic: Array) -> Array:
-    """S0/2 at each pixel: mean of the four 2x2 windows it belongs to, weighted against gradients toward them."""
+    """Estimate S0/2 at each pixel: mean of its four 2x2 windows, weighted against gradients toward them."""
     at = _neighbors(mosaic)
     total = np.zeros_like(mosaic)
     weights = np.zeros_like(mosaic)
     for down in (-1, 1):
         for right in (-1, 1):
             window = (mosaic + at(down, 0) + at(0, right) + at(down, right)) / 4
-            # Only samples of one angle are compared: others differ by polarization, not by edges.
+            # Only samples of one angle are compared. Other differences are polarization, not edges.
             outward = ((2 * down, 0), (0, 2 * right), (2 * down, 2 * right))
             across = ((down, 0), (0, right), (down, right))
             gradient = sum(np.abs(at(y, x) - mosaic) for y, x in outward)
@@ -86,9 +88,9 @@ def _half_s0(mosaic: Array) -> Array:
 
 
 def _neighbors(values: Array) -> Callable[[int, int], Array]:
-    """Return a function of (y, x) that gives each pixel the value ``y`` pixels below and ``x`` to the right of it."""
+    """Return a function of (y, x) that shifts the picture: the value ``y`` pixels below and ``x`` to the right."""
     height, width = values.shape
-    # Reflected about the outermost pixel, so that the pattern goes on.
+    # Reflection about the outermost pixel continues the pattern.
     padded = cv2.copyMakeBorder(values, 2, 2, 2, 2, cv2.BORDER_REFLECT_101)
 
     def at(y: int, x: int) -> Array:
@@ -102,7 +104,7 @@ def _filtered(values: Array) -> Array:
 
 
 DEMOSAIC_MODES = {"half": 2, "quarter": 4, "full": 1}
-"""Modes, and the sensor pixels that become one picture pixel, each way."""
+"""Sensor pixels per picture pixel in each direction, by mode."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,8 +112,8 @@ class DemosaicedPicture:
     """Demosaiced intensities.
 
     Attributes:
-        intensities: [4, h, w, 3] float32, linear, for 0, 45, 90 and 135 degrees.
-        invalid: pixels for which an unusable sample was used, [h, w].
+        intensities: linear intensities at 0, 45, 90 and 135 degrees, [4, h, w, 3] float32.
+        invalid: mask of pixels that use an unusable sample, [h, w].
     """
 
     intensities: Array
@@ -131,25 +133,25 @@ def demosaic(
     """Demosaic one mosaic.
 
     ``half``: each 2x2 polarizer cell is one pixel; the cells of a color sensor form a Bayer picture per angle.
-    ``quarter``: each 4x4 superpixel is one pixel, the mean of its samples of an angle and color; nothing is
-    interpolated. ``full``: every sensor pixel; colors are interpolated between cells of one angle, then angles
-    between neighboring pixels.
+    ``quarter``: each 4x4 superpixel is one pixel, the mean of its samples of an angle and color, without interpolation.
+    ``full``: every sensor pixel; colors are interpolated between cells of one angle, then angles between neighboring
+    pixels.
 
-    The four samples of a cell lie half a cell apart. ``half`` brings them to its center if ``registered``: S1 and S2
-    are means over the cell of what ``full`` makes of it, and so is S0 if interpolation is guided; bilinear
-    interpolation would only blur S0, which is that of the cell's own samples.
+    The four samples of a cell are half a cell apart. If ``registered``, ``half`` interpolates them at its center: S1
+    and S2 are means over the cell in ``full``, and so is S0 of guided interpolation. Bilinear interpolation would blur
+    S0, which is that of the cell's own samples.
 
     Args:
-        values: linear intensities [H, W], black level and gains already applied.
-        bad: unusable samples, [H, W].
+        values: linear intensities [H, W] after black level and gains.
+        bad: mask of unusable samples, [H, W].
         pattern: pattern of the top-left pixel, which starts a whole polarizer cell.
         mode: a key of ``DEMOSAIC_MODES``.
         interpolation: ``bilinear`` or ``guided``; ``quarter`` and a monochrome ``half`` interpolate no colors.
-        registered: whether ``half`` brings the four angles to one place.
-        colored: whether a monochrome sensor gives three equal channels; else it gives one.
+        registered: if True, ``half`` moves the four angles to one place.
+        colored: if True, a monochrome sensor gives three equal channels, else one channel.
 
     Returns:
-        The picture, of size ``H // s`` x ``W // s`` for s = 2, 4 or 1 (what fills no cell is cut).
+        The picture of size ``H // s`` x ``W // s`` for s = 2, 4 or 1, without incomplete cells.
     """
     invalid = spoiled(bad, pattern, mode=mode, interpolation=interpolation, registered=registered)
     step = 4 if mode == "quarter" else 2
@@ -171,25 +173,24 @@ def demosaic(
 
 
 def spoiled(bad: Mask, pattern: Pattern, *, mode: str, interpolation: str, registered: bool = True) -> Mask:
-    """The pixels for which ``demosaic`` uses an unusable sample; arguments and size as there."""
+    """Return a mask of the pixels for which ``demosaic`` uses an unusable sample; arguments are the same."""
     step = DEMOSAIC_MODES[mode]
-    whole = 4 if mode == "quarter" else 2
-    bad = bad[: bad.shape[0] // whole * whole, : bad.shape[1] // whole * whole]
+    unit = 4 if mode == "quarter" else 2
+    bad = bad[: bad.shape[0] // unit * unit, : bad.shape[1] // unit * unit]
     if not bad.any():
         return np.zeros((bad.shape[0] // step, bad.shape[1] // step), bool)
     if mode != "quarter":
         colored = np.empty_like(bad)
         for row, column in np.ndindex(2, 2):
             colored[row::2, column::2] = _spoiled_colors(bad, pattern, (row, column), interpolation)
-        # Around every pixel the 3x3 pixels hold what is used of all angles.
+        # The 3x3 pixels around a pixel have all angles that it uses.
         full = _dilated(colored, 1 if interpolation == "bilinear" else GUIDED_RADIUS)
         bad = full if mode == "full" else colored | full if registered else colored
-    blocks = bad.reshape(bad.shape[0] // step, step, bad.shape[1] // step, step)
-    return np.asarray(blocks.any(axis=(1, 3)))
+    return np.asarray(bad.reshape(bad.shape[0] // step, step, bad.shape[1] // step, step).any(axis=(1, 3)))
 
 
 def _spoiled_colors(bad: Mask, pattern: Pattern, place: tuple[int, int], interpolation: str) -> Mask:
-    """At one place of the cells, where colors use an unusable sample."""
+    """Return a mask of the colors at one place of the cells that use an unusable sample."""
     row, column = place
     mask = bad[place[0] :: 2, place[1] :: 2]
     if pattern.colors is None:
@@ -205,7 +206,7 @@ def _spoiled_colors(bad: Mask, pattern: Pattern, place: tuple[int, int], interpo
 
 
 _Cells = dict[tuple[int, int], Array]
-"""Colors at every sensor pixel: position (row, column) in the cell -> [H/2, W/2, C]."""
+"""Colors [H/2, W/2, C] by position (row, column) in the cell."""
 
 
 def _cells(values: Array, pattern: Pattern, interpolation: str) -> _Cells:
@@ -226,13 +227,13 @@ def _cells(values: Array, pattern: Pattern, interpolation: str) -> _Cells:
 
 
 def _full(cells: _Cells, pattern: Pattern, interpolation: str) -> Array:
-    """Full size: each channel is the mosaic of a monochrome polarization sensor."""
+    """Interpolate angles at full size. Each channel is like the mosaic of a monochrome sensor."""
     height, width, channels = cells[0, 0].shape
     mosaic = np.empty((channels, 2 * height, 2 * width), np.float32)
     for (row, column), colors in cells.items():
         mosaic[:, row::2, column::2] = colors.transpose(2, 0, 1)
     at = {int(pattern.angles[place]): place for place in cells}
-    # A plane of every angle and channel in turn; the channels come last only as they are looked at.
+    # Planes by angle and channel; channels move to the end as a view.
     planes = np.empty((len(ANGLES), channels, 2 * height, 2 * width), np.float32)
     for channel, plane in enumerate(mosaic):
         if interpolation == "bilinear":
@@ -247,7 +248,7 @@ def _full(cells: _Cells, pattern: Pattern, interpolation: str) -> Array:
 
 
 def _registered(plain: Array, full: Array, interpolation: str) -> Array:
-    """Half size, all angles at the centers of the cells."""
+    """Average full-size angles over cells, so that all are at the centers of the cells."""
     angles, height, width, channels = plain.shape
     cells = full.reshape(angles, height, 2, width, 2, channels)
     upper, lower = (cells[:, :, row, :, 0] + cells[:, :, row, :, 1] for row in (0, 1))
@@ -258,7 +259,7 @@ def _registered(plain: Array, full: Array, interpolation: str) -> Array:
 
 
 def _superpixels(values: Array, pattern: Pattern) -> Array:
-    """Quarter size: means over the samples of one angle and color in each 4x4 pixels."""
+    """Average the samples of one angle and color in each 4x4 pixels."""
     repeat = 4 // pattern.period
     angles = np.tile(pattern.angles, (repeat, repeat))
     colors = None if pattern.colors is None else np.tile(pattern.colors, (repeat, repeat))
@@ -269,8 +270,9 @@ def _superpixels(values: Array, pattern: Pattern) -> Array:
     for index, angle in enumerate(ANGLES):
         for channel in range(picture.shape[3]):
             chosen = angles == angle if colors is None else (angles == angle) & (colors == channel)
-            samples = [blocks[:, row, :, column] for row, column in np.argwhere(chosen)]
-            picture[index, ..., channel] = np.mean(samples, axis=0, dtype=np.float32)
+            picture[index, ..., channel] = np.mean(
+                [blocks[:, row, :, column] for row, column in np.argwhere(chosen)], axis=0, dtype=np.float32
+            )
     return picture
 
 
@@ -282,27 +284,27 @@ def _dilated(mask: Mask, radius: int) -> Mask:
 
 
 _BEYOND_NOISE = 6.0
-"""Standard deviations of the sensor's own noise: less happens by chance in some of millions of samples."""
+"""Threshold in standard deviations of the sensor's noise. Some of millions of samples exceed less by chance."""
 _OF_LIGHT = 0.5
-"""Light that raises one analyzer raises the two at 45 degrees to it by as much together; a defect does not."""
+"""Smallest joint rise of the analyzers at 45 degrees, relative to a rise by light. A defect causes none."""
 _BINS = 16
 _AGREE = 0.5
-"""Share of the views in which a sample has to stand out. Light moves from view to view; defects stay."""
+"""Share of the views in which a defect must be an outlier. Light changes from view to view; defects do not."""
 _SAME_SIGN = 0.75
-"""Share of these views in which it has to lie on one side: views above less views below."""
+"""Share of the views in which a defect must be on one side: views above minus views below."""
 
 
 def outliers(values: NDArray[Any], period: int) -> tuple[NDArray[np.bool_], NDArray[np.int8]]:
-    """Samples of one mosaic that stand out from all alike, [H, W]; and where samples lie above (1) or below (-1) the
-    median of those alike by more than noise explains.
+    """Find the outliers of one mosaic, [H, W], and the sign of significant differences from the median of neighbors.
 
-    A sample stands out if it lies beyond its eight neighbors behind one analyzer and color by more than these differ
-    among themselves and than noise explains, while the other analyzers of its cell see nothing of it. The noise is that
-    of the sensor at that brightness: the median deviation of samples from the median of their neighbors.
+    Neighbors are the eight nearest samples behind the same analyzer and color. A sample is an outlier if it exceeds
+    their range by more than this range and by more than noise, while the other analyzers of its cell do not change. The
+    noise
+    is that of the sensor at this brightness: the median deviation of samples from the median of their neighbors.
 
     Args:
-        values: [H, W] stored values, beginning with a whole cell; sides are even.
-        period: pixels after which the pattern repeats.
+        values: stored values [H, W] that start with a whole cell; sides are even.
+        period: period of the pattern in pixels.
     """
     height, width = values.shape
     padded = np.pad(values, period, mode="reflect")
@@ -322,64 +324,61 @@ def outliers(values: NDArray[Any], period: int) -> tuple[NDArray[np.bool_], NDAr
     rise = values - middle
     beyond = np.abs(rise) - np.maximum(most - middle, middle - least)
     off = np.abs(rise) > _BEYOND_NOISE * _noise(rise, middle)
-    return np.asarray(off & (beyond > spread) & _alone(rise)), (np.sign(rise) * off).astype(np.int8)
+    return np.asarray(off & (beyond > spread) & _is_isolated(rise)), (np.sign(rise) * off).astype(np.int8)
 
 
 _NETWORK = (
     (0, 1), (2, 3), (4, 5), (6, 7), (0, 2), (1, 3), (4, 6), (5, 7), (1, 2), (5, 6),
     (0, 4), (1, 5), (2, 6), (3, 7), (2, 4), (3, 5), (1, 2), (3, 4), (5, 6),
 )  # fmt: skip
-"""Comparisons that sort eight values (Batcher's odd-even merge sort): on whole pictures, faster than a sort of each
-pixel."""
+"""Comparisons that sort eight values (Batcher's odd-even merge sort), faster on whole pictures than sorting pixels."""
 
 
 def _noise(rise: NDArray[np.float32], middle: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Standard deviation of the noise of each sample, by brightness."""
+    """Return the standard deviation of the noise of each sample by brightness."""
     step = max(1, rise.size >> 20)
     level = middle.ravel()[::step]
     deviation = np.abs(rise).ravel()[::step]
     edges = np.quantile(level, np.linspace(0, 1, _BINS + 1)).astype(np.float32)
-    # One brightness of many samples, such as black, is a bin of its own: it says nothing of the noise of others.
+    # A frequent brightness, such as black, is a bin of its own, because it has no influence on the noise of others.
     common = edges[1:][np.diff(edges) == 0]
     edges = np.unique(np.concatenate((edges, np.nextafter(common, np.float32(np.inf)))))
     number = np.clip(np.searchsorted(edges, level, side="right") - 1, 0, max(0, len(edges) - 2))
     bins = max(1, len(edges) - 1)
-    together = deviation[np.argsort(number.astype(np.uint8), kind="stable")]  # by bin
+    sorted_deviation = deviation[np.argsort(number.astype(np.uint8), kind="stable")]  # by bin
     ends = np.cumsum(np.bincount(number, minlength=bins))
-    medians = [float(np.median(each)) for each in np.split(together, ends[:-1])]
+    medians = [float(np.median(each)) for each in np.split(sorted_deviation, ends[:-1])]
     place = np.clip(np.searchsorted(edges, middle, side="right") - 1, 0, len(medians) - 1)
-    # Whole numbers are rounded: no noise is less than a third of a step.
+    # Rounding to whole numbers causes noise of a third of a step.
     return np.maximum(1.4826 * np.asarray(medians, np.float32), 1 / 3)[place]
 
 
-def _alone(rise: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Whether the analyzers at 45 degrees to a sample's rise or fall together by less than half of what it does."""
+def _is_isolated(rise: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Return a mask of samples whose rise is more than double the joint rise of the analyzers at 45 degrees."""
     cell = [rise[row::2, column::2] for row, column in np.ndindex(2, 2)]
-    # Analyzers at right angles lie along the diagonals of a cell.
-    beside = {0: cell[1] + cell[2], 3: cell[1] + cell[2], 1: cell[0] + cell[3], 2: cell[0] + cell[3]}
-    alone = np.empty(rise.shape, bool)
+    # Analyzers at right angles are on the diagonals of a cell.
+    others = {0: cell[1] + cell[2], 3: cell[1] + cell[2], 1: cell[0] + cell[3], 2: cell[0] + cell[3]}
+    isolated = np.empty(rise.shape, bool)
     for number, (row, column) in enumerate(np.ndindex(2, 2)):
-        mine = cell[number]
-        alone[row::2, column::2] = np.sign(mine) * beside[number] < _OF_LIGHT * np.abs(mine)
-    return alone
+        own = cell[number]
+        isolated[row::2, column::2] = np.sign(own) * others[number] < _OF_LIGHT * np.abs(own)
+    return isolated
 
 
 def defects(mosaics: Iterable[NDArray[Any]], period: int) -> NDArray[np.bool_]:
-    """The samples that stand out in at least half of the mosaics of a capture and are off in nearly all, [H, W]."""
-    votes: NDArray[np.int32] | None = None
-    signs: NDArray[np.int32] | None = None
+    """Return a mask [H, W] of samples that are outliers in half of the mosaics and differ in nearly all."""
+    votes: Any = 0
+    signs: Any = 0
     count = 0
     for values in mosaics:
         out, sign = outliers(values, period)
-        votes = out.astype(np.int32) if votes is None else votes + out
-        signs = sign.astype(np.int32) if signs is None else signs + sign
+        votes = np.add(votes, out, dtype=np.int32)
+        signs = np.add(signs, sign, dtype=np.int32)
         count += 1
-    assert votes is not None
-    assert signs is not None
     return np.asarray((votes >= _AGREE * count) & (np.abs(signs) >= _SAME_SIGN * count))
 
 
 def defects_note(count: int, samples: int) -> str:
-    """A note for the user on the number of defects among all samples of a mosaic."""
+    """Return a note for the user on the number of defects among the samples of a mosaic."""
     share = f"{count} samples ({count / samples:.3%})"
-    return f"{share} stand out from all alike beside them (hot or dead pixels): invalid."
+    return f"{share} differ from all similar neighbors (hot or dead pixels) and are invalid."

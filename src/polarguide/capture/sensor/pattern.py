@@ -1,4 +1,4 @@
-"""A sensor's pattern of polarizers and color filters, its radiometric levels, and whether samples fit either."""
+"""Pattern of polarizers and color filters of a sensor, and its radiometric levels."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from msgspec import Meta
 from numpy.typing import NDArray
 from tyro.constructors import PrimitiveConstructorSpec
 
-from polarguide.core.errors import PolarguideError
+from polarguide.core.errors import PolarguideError, require
 
 _CELL = np.array([[90, 45], [135, 0]])
-_BAYER = np.array([[0, 1], [1, 2]])  # R G / G B, one entry a polarizer cell
+_BAYER = np.array([[0, 1], [1, 2]])  # R G / G B, one entry per polarizer cell
 
 Sensor = Literal["IMX250MYR", "IMX250MZR", "IMX253MYR", "IMX253MZR", "IMX264MYR", "IMX264MZR"]
 SENSORS: dict[str, bool] = {name: name.endswith("MYR") for name in get_args(Sensor)}
-"""Sony sensors by name, and whether they are color sensors. All color ones have one pattern, all others another."""
+"""Sony sensors by name; True for color sensors. All color sensors have one pattern, all monochrome sensors another."""
 SENSOR_NAMES = (
     "IMX250MYR, IMX253MYR, IMX264MYR (color), IMX250MZR, IMX253MZR, IMX264MZR (monochrome), a camera's model"
 )
-"""The same for people."""
+"""Names of the sensors for the user."""
 SENSOR_SIZES = {name: (4112, 3008) if "253" in name else (2464, 2056) for name in SENSORS}
-"""Width and height in pixels; cameras give some less, such as 2448 x 2048."""
+"""Width and height in pixels. Cameras deliver somewhat less, such as 2448 x 2048."""
 
 _CAMERAS: dict[str, Sensor] = {
     "PHX050S-P": "IMX250MZR", "TRI050S-P": "IMX250MZR", "BFS-U3-51S5P": "IMX250MZR", "BFS-PGE-51S5P": "IMX250MZR",
@@ -37,36 +37,36 @@ _CAMERAS: dict[str, Sensor] = {
     "BFS-PGE-123S6P": "IMX253MZR",
     "PHX050S1-P": "IMX264MZR", "TRI050S1-P": "IMX264MZR", "PHX050S1-Q": "IMX264MYR", "TRI050S1-Q": "IMX264MYR",
 }  # fmt: skip
-"""The sensor of a camera by the maker's model name, which a mount or an interface of three letters may follow."""
+"""Sensors by the maker's model name of a camera. Up to three letters for mount or interface may follow."""
 _MOUNT = re.compile(r"-?[A-Z0-9]{0,3}")
 
 
-def _spelled(name: str) -> str:
-    """A name in capitals, with hyphens for blanks: people and programs write names either way."""
+def _normalized(name: str) -> str:
+    """Convert a name to capitals, with hyphens instead of blanks."""
     return re.sub(r"[\s_]+", "-", name.strip()).upper()
 
 
 def sensor_named(name: str) -> str:
-    """The sensor of this name, or in the camera of this model, after its maker or not; another word as it is."""
-    whole = _spelled(name)
-    # The longest: BFS-U3-51S5PC is another camera than BFS-U3-51S5P with the mount C.
+    """Return the sensor of a sensor's name or a camera's model, with or without its maker; other names unchanged."""
+    full = _normalized(name)
+    # The longest match: BFS-U3-51S5PC is not BFS-U3-51S5P with the mount C.
     models = sorted(_CAMERAS, key=len, reverse=True)
-    for start in (0, *(found.end() for found in re.finditer("-", whole))):
-        spelled = whole[start:]
-        if spelled in SENSORS:
-            return spelled
+    for start in (0, *(hyphen.end() for hyphen in re.finditer("-", full))):
+        text = full[start:]
+        if text in SENSORS:
+            return text
         for model in models:
-            begin = _spelled(model)
-            if spelled.startswith(begin) and _MOUNT.fullmatch(spelled[len(begin) :]):
+            prefix = _normalized(model)
+            if text.startswith(prefix) and _MOUNT.fullmatch(text[len(prefix) :]):
                 return _CAMERAS[model]
     return name
 
 
 def require_sensor(name: str | None) -> None:
-    """Refuse a name that is no sensor's and no known camera's.
+    """Refuse a name that is not a sensor's.
 
     Raises:
-        PolarguideError: it is such a one.
+        PolarguideError: the name is unknown.
     """
     if name is None or name in SENSORS:
         return
@@ -74,13 +74,13 @@ def require_sensor(name: str | None) -> None:
         "--sensor",
         expected=f"a sensor ({', '.join(SENSORS)}) or a camera's model ({', '.join(_CAMERAS)})",
         found=repr(name),
-        remedy="Give the sensor of the camera's data sheet. IMX250MZR has the same pattern as all monochrome ones, "
-        "IMX250MYR as all color ones.",
+        remedy="Enter the sensor of the camera's data sheet. IMX250MZR has the pattern of all monochrome sensors, "
+        "IMX250MYR that for color.",
     )
 
 
 def any_case(*names: str) -> PrimitiveConstructorSpec[Any]:
-    """How the command line reads one of some names, sensors among them; the settings check it."""
+    """Create the command-line parser of names, including camera models. The settings check the result."""
     return PrimitiveConstructorSpec(
         nargs=1,
         metavar=f"{{{','.join(names)}}}",
@@ -93,7 +93,7 @@ def any_case(*names: str) -> PrimitiveConstructorSpec[Any]:
 SensorName = Annotated[Sensor, any_case(*SENSORS)]
 
 Packing = Literal["8", "16", "16be", "10p", "10packed", "10mipi", "12p", "12packed", "12mipi"]
-"""How ``.raw`` files hold values, see ``sensor.raw_file.PACKINGS``."""
+"""Layout of values in ``.raw`` files, see ``sensor.raw_file.PACKINGS``."""
 
 
 NotNegative = Annotated[int, Meta(ge=0, le=1 << 20)]
@@ -102,16 +102,16 @@ Positive = Annotated[int, Meta(ge=1, le=1 << 31)]
 
 @dataclass(frozen=True)
 class MosaicOptions:
-    """How raw mosaics lie in their files, and on the sensor.
+    """Options of raw mosaics: their files, and their place on the sensor.
 
     Attributes:
         sensor: Sensor of raw mosaics (IMX250, IMX253 or IMX264 with MYR for color, MZR for monochrome), or the model of
             the camera.
         packing: Packing of .raw files (there are several of 10 and of 12 bits; never guessed).
-        width: Width of .raw files in pixels; others must have it, too.
+        width: Width of .raw files in pixels; other files must have it as well.
         height: Height of .raw files in pixels.
         offset_x: Column of the sensor at which the region of interest starts.
-        offset_y: Row of the sensor at which it starts.
+        offset_y: Row of the sensor at which the region of interest starts.
         black_level: Stored value without light.
     """
 
@@ -130,11 +130,11 @@ class MosaicOptions:
 
 @dataclass(frozen=True, eq=False)
 class Pattern:
-    """The repeating pattern of a sensor or of a region of it.
+    """Repeating pattern of a sensor or of a region of it.
 
     Attributes:
-        angles: polarizer angle of each pixel in degrees, [4, 4] for a color sensor, [2, 2] for a monochrome one.
-        colors: 0, 1, 2 for R, G, B in the same shape, or None for a monochrome sensor.
+        angles: polarizer angle of each pixel in degrees, [4, 4] for a color sensor, [2, 2] for a monochrome sensor.
+        colors: 0, 1, 2 for R, G, B in the same shape; None for a monochrome sensor.
     """
 
     angles: NDArray[np.int64]
@@ -142,20 +142,20 @@ class Pattern:
 
     @property
     def period(self) -> int:
-        """Pixels after which the pattern repeats, each way: 4 or 2."""
+        """Period of the pattern in pixels: 4 or 2."""
         return int(self.angles.shape[0])
 
     def shifted(self, x: int, y: int) -> Pattern:
-        """The pattern of a region whose top-left pixel is column ``x``, row ``y`` of this one."""
+        """Return the pattern of a region whose top-left pixel is column ``x``, row ``y`` of this one."""
         return Pattern(
             np.roll(self.angles, (-y, -x), axis=(0, 1)),
             None if self.colors is None else np.roll(self.colors, (-y, -x), axis=(0, 1)),
         )
 
     def cell_corner(self) -> tuple[int, int]:
-        """Columns and rows to cut so that the region starts with a whole polarizer cell of one color.
+        """Return the number of columns and rows before the first whole polarizer cell of one color.
 
-        A monochrome pattern needs none: any 2x2 pixels hold all four angles.
+        They are zero for a monochrome pattern, because any 2x2 pixels have all four angles.
         """
         if self.colors is None:
             return 0, 0
@@ -164,7 +164,7 @@ class Pattern:
         return x, y
 
     def rows(self) -> list[str]:
-        """The pattern as text, one string per row: "R90 R45 G90 G45", ..."""
+        """Format the pattern as text, one string per row: "R90 R45 G90 G45", ..."""
         names = self.angles.astype(str).astype(object)
         if self.colors is not None:
             names = np.array(list("RGB"), dtype=object)[self.colors] + names
@@ -172,13 +172,13 @@ class Pattern:
 
 
 def tiled(pattern: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:
-    """A pattern repeated over [H, W]."""
+    """Repeat a pattern over [H, W]."""
     repeat = [-(-length // period) for length, period in zip(shape, pattern.shape, strict=True)]
     return np.tile(pattern, repeat)[: shape[0], : shape[1]]
 
 
 def sensor_pattern(sensor: str) -> Pattern:
-    """The pattern of a whole sensor, from its top-left pixel.
+    """Return the pattern of a whole sensor from its top-left pixel.
 
     Raises:
         PolarguideError: the sensor is unknown.
@@ -199,9 +199,9 @@ class Levels:
 
     Attributes:
         bits: bits of a sensor value.
-        white: the value that becomes linear 1.
-        saturation: the value from which a sample counts as saturated.
-        black: the value without light.
+        white: stored value of linear 1.
+        saturation: smallest stored value of a saturated sample.
+        black: stored value without light.
         gamma: exponent of the stored values: stored = linear ^ gamma.
     """
 
@@ -216,11 +216,11 @@ class Levels:
         return self.bits == container and self.saturation == self.white
 
     def linear(self, values: NDArray[Any], dark: NDArray[np.float32] | None = None) -> NDArray[np.float32]:
-        """(value - black) / (white - black), made linear, float32; noise below black stays negative.
+        """Return (value - black) / (white - black), made linear, float32. Noise below black stays negative.
 
         Args:
-            values: [..., H, W] stored values.
-            dark: dark frame in stored values, in the same shape; it takes the place of the black level pixel by pixel.
+            values: stored values, [..., H, W].
+            dark: dark frame in stored values, in the same shape, instead of the black level.
         """
         floor = np.float32(self.black) if dark is None else dark
         scaled = ((values.astype(np.float32) - floor) / np.float32(self.white - self.black)).astype(
@@ -245,21 +245,20 @@ def estimate_levels(
 ) -> Levels:
     """Estimate the full scale of a capture.
 
-    Without ``bits``: as the files state; else 8 in 8-bit files; in 16-bit files those of the value at which samples
-    pile up, else 12 if no value exceeds 4095 (the sensors' converters have 12 bits), else 16. Values whose low bits are
-    never used (12 bits shifted to the top of 16) end at the last value that can occur.
+    Without ``bits``, the files' full scale applies, or 8 bits for 8-bit files. In 16-bit files the bits are those of
+    the value at which samples pile up, else 12 if no value exceeds 4095 (the sensors' converters have 12 bits), else
+    16. If low bits are never used (12 bits shifted to the top of 16), full scale is the largest possible value.
 
     Args:
-        largest: the largest stored value of the capture.
+        largest: largest stored value of the capture.
         used: bitwise or of all stored values.
         container: bits of the files' values, or of a packed pixel.
         bits: bits of a sensor value, or None.
         black: black level in stored values.
         saturation: stored value at which the sensor saturates, or None for full scale.
-        counts: how often each stored value occurs, from 0 on.
-        stated: full scale that the files state; None where they do not.
-        alone: whether the values are those of a single shot of a series, which do not imply the full scale by piling
-            up.
+        counts: histogram of the stored values from 0.
+        stated: full scale in the files' headers, or None.
+        alone: True for a single shot of a series, in which piled-up values do not imply the full scale.
 
     Raises:
         PolarguideError: a value exceeds the range, or the levels are not in order.
@@ -270,64 +269,63 @@ def estimate_levels(
         bits = stated.bit_length()
     elif bits is None:
         bits = (None if alone else clipped) or (12 if container == 16 and largest < 4096 else container)
-    if largest >= 1 << bits:
-        raise PolarguideError(
-            "--bits",
-            expected=f"values below {1 << bits} for {bits} bits",
-            found=str(largest),
-            remedy="Give the number of bits that the files really use.",
-        )
+    require(
+        largest < 1 << bits,
+        "--bits",
+        expected=f"values below {1 << bits} for {bits} bits",
+        found=str(largest),
+        remedy="Enter the number of bits that the files use.",
+    )
     white = stated or (1 << bits) - 1
     unused = (used & -used).bit_length() - 1 if used else 0
     if container == 16 and 0 < unused <= 8:
         white = white >> unused << unused
     top = white if clipped is None else min(white, largest)
     top = top if saturation is None else saturation
-    if not 0 <= black < top <= white:
-        raise PolarguideError(
-            "--black-level" if not 0 <= black < white else "--saturation",
-            expected=f"0 <= black level < saturation <= {white}",
-            found=f"black level {black:g}, saturation {top}",
-            remedy=f"Give both in stored values, for {bits} bits.",
-        )
+    require(
+        0 <= black < top <= white,
+        "--black-level" if not 0 <= black < white else "--saturation",
+        expected=f"0 <= black level < saturation <= {white}",
+        found=f"black level {black:g}, saturation {top}",
+        remedy=f"Enter both in stored values, for {bits} bits.",
+    )
     return Levels(bits, white, top, float(black))
 
 
 def agreed_full_scale(stated: Mapping[Path, int | None]) -> int | None:
-    """The full scale that all files of a capture state; None where none does.
+    """Return the full scale that all files of a capture state; None if they state none.
 
     Raises:
-        PolarguideError: two say otherwise.
+        PolarguideError: two files differ.
     """
     (first, full), *others = stated.items()
     for path, other in others:
-        if other != full:
-            raise PolarguideError(
-                path,
-                expected=f"{_full_words(full)}, like {first.name}",
-                found=_full_words(other),
-                remedy="Export all files with the same settings, or give --bits.",
-            )
+        require(
+            other == full,
+            path,
+            expected=f"{_full_text(full)}, like {first.name}",
+            found=_full_text(other),
+            remedy="Export all files with the same settings, or use --bits.",
+        )
     return full
 
 
-def _full_words(full: int | None) -> str:
+def _full_text(full: int | None) -> str:
     return "a file that states no full scale" if full is None else f"a file that states full scale {full}"
 
 
-_FEWEST_CLIPPED = 3
-_PILE = 3
-_BESIDE = 50
-"""A pile of clipped samples: as many at least; times as many as any value has that is smaller by a fiftieth or less."""
+_FEWEST_CLIPPED = 3  # smallest number of samples in a pile
+_PILE = 3  # smallest ratio to the counts of smaller values
+_BESIDE = 50  # the compared values are smaller by up to a fiftieth
 
 
 def clipping_bits(counts: NDArray[np.int64]) -> int | None:
-    """Bits of a sensor whose clipped samples pile up at the largest value of 16-bit files; None where they do not.
+    """Return the bits of a sensor with a pile of clipped samples at the largest value of 16-bit files, or None.
 
-    A converter of b bits clips at 2^b - 1. Other values at which samples pile up may be those of a bright surface.
+    A converter of b bits clips at 2^b - 1. A pile at another value may be a bright surface.
 
     Args:
-        counts: how often each stored value occurs, from 0 on.
+        counts: histogram of the stored values from 0.
     """
     occurring = np.flatnonzero(counts)
     top = int(occurring[-1]) if len(occurring) else 0
@@ -345,36 +343,39 @@ def level_notes(
     bits: int | None,
     stated: int | None = None,
 ) -> list[str]:
-    """Notes for the user on levels that the files' type does not imply; ``bits``, ``stated``: as for the estimate."""
+    """Return notes for the user on estimated levels; for ``bits`` and ``stated`` see ``estimate_levels``."""
     notes = []
     if bits is None and stated is not None:
-        notes.append(f"{levels.white} is full scale, as the files state (--bits says otherwise).")
+        notes.append(f"{levels.white} is full scale according to the files (change with --bits).")
     if container != 16:
         return notes
     if bits is None and stated is None:
-        notes.append(f"Values fill {levels.bits} bits (--bits says otherwise); {levels.white} is full scale.")
+        notes.append(f"Values fill {levels.bits} bits (change with --bits); {levels.white} is full scale.")
     if counts is not None and clipping_bits(counts) is not None and levels.saturation < FULL_16:
         top = int(np.flatnonzero(counts)[-1])
         share = float(counts[levels.saturation :].sum() / counts.sum())
-        hint = "(--bits and --saturation say otherwise)"
+        hint = "(change with --bits and --saturation)"
         if top < levels.white:
             hint = f"(--bits {top.bit_length()} makes it full scale)"
-        notes.append(f"Values pile up at {top} ({share:.1%} of the samples): taken as saturated {hint}.")
+        notes.append(
+            f"Values pile up at {top} ({share:.1%} of the samples), which counts as saturated {hint}."
+        )
     return notes
 
 
 def unusable_samples(
     values: NDArray[Any], levels: Levels, dark: NDArray[np.float32] | None = None
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Saturated and dark samples of a mosaic that starts with a whole polarizer cell.
+    """Return masks of saturated and dark samples of a mosaic that starts with a whole polarizer cell.
 
-    A sample is saturated from ``levels.saturation`` up. It is dark if it was cut off at 0 below a black level,
-    or if none of the four samples of its 2x2 cell exceeds black: then there is no light whose polarization
-    could be told. One angle at black beside brighter ones is kept, for that is what a surface at Brewster's
-    angle looks like.
+    A sample is saturated from ``levels.saturation``. It is dark if it is clipped at 0 below a black level, or if none
+    of
+    the four samples of its 2x2 cell exceeds black: then there is no light whose polarization could be measured. A
+        single
+    black angle next to brighter ones is valid, because surfaces at Brewster's angle look like this.
 
     Args:
-        values: [H, W] stored values, H and W even.
+        values: stored values [H, W], H and W even.
         levels: levels of the capture.
         dark: dark frame in stored values, [H, W].
 
@@ -392,39 +393,40 @@ def unusable_samples(
 
 Kind = Literal["color", "monochrome"]
 SIDE = 8
-"""Pixels along a block that is looked at: 4 x 4 cells of polarizers."""
+"""Side of the compared blocks in pixels: 4 x 4 cells of polarizers."""
 _FEWEST = 100
 _DIFFERENT = 0.02
-"""Median second difference of cells, as a share of their mean, above which there are color filters."""
+"""Median second difference of cells relative to their mean, above which there are color filters."""
 _EQUAL = 0.006
-"""The same, below which there are none."""
+"""Median second difference of cells relative to their mean, below which there are no color filters."""
 _STRONGER = 1.5
-"""Ratio of typical differences across filters to those within one, from which on there are filters."""
+"""Ratio of typical differences across filters to those within one, above which there are color filters."""
 _ALIKE = 1.35
-"""Ratio up to which there are none."""
+"""Ratio of these differences below which there are no color filters."""
 _SMALL = 0.004
-"""Differences that count as none."""
+"""Smallest relative difference above noise."""
 
 
 def color_filters(blocks: NDArray[Any], saturation: float, floor: float = 0.0) -> Kind | None:
-    """Whether 2x2 cells of polarizers lie behind a Bayer pattern of color filters.
+    """Detect whether 2x2 cells of polarizers are behind a Bayer pattern of color filters.
 
-    The sum over a cell's four angles is that of the light, whatever its polarization. In a Bayer pattern two of four
-    cells are green, along one diagonal, and those along the other take turns in red and blue: second differences,
-    which leave the gradients of the picture out, are then large in the same way everywhere. Without filters they are
-    small, alike along both diagonals, and have no sign.
+    The sum over a cell's four angles measures light regardless of polarization. In a Bayer pattern two of four cells
+    are green, along one diagonal; red and blue alternate along the other. Second differences remove the gradients of
+    the picture. With color filters they are large and have the same sign everywhere. Without color filters they are
+    small, equal along both diagonals, and have no sign.
 
     Args:
-        blocks: stored values [N, 8, 8] that begin with a cell.
-        saturation: the value from which a sample is saturated. floor: the value without light.
+        blocks: stored values [N, 8, 8] that start with a cell.
+        saturation: smallest stored value of a saturated sample.
+        floor: stored value without light.
 
     Returns:
-        None where the samples do not tell: too few, too dark, or gray light on balanced filters.
+        The kind of sensor; None if samples are too few, too dark, or gray behind balanced filters.
     """
     lit = (blocks < saturation).all(axis=(1, 2))
     cells = blocks[lit].reshape(-1, 4, 2, 4, 2).sum(axis=(2, 4), dtype=np.float64) - 4 * floor
     mean = cells.mean(axis=(1, 2))
-    # A cell in the noise of the read-out says nothing.
+    # Dark cells are dominated by read-out noise.
     bright = mean > 4 * (saturation - floor) / 200
     if bright.sum() < _FEWEST:
         return None
@@ -441,13 +443,15 @@ def color_filters(blocks: NDArray[Any], saturation: float, floor: float = 0.0) -
 
 
 def require_kind(sensor: str, blocks: NDArray[Any], levels: Levels) -> None:
-    """Refuse mosaics of the other kind of sensor: nothing later would tell.
+    """Refuse mosaics of the other kind of sensor. No later step would detect this mistake.
 
     Args:
-        sensor: its name, a key of ``SENSORS``. blocks: as for ``color_filters``. levels: levels of the stored values.
+        sensor: name of the sensor, a key of ``SENSORS``.
+        blocks: stored values, see ``color_filters``.
+        levels: levels of the stored values.
 
     Raises:
-        PolarguideError: the samples say that it is another one.
+        PolarguideError: the samples contradict the sensor.
     """
     filters = color_filters(blocks, levels.saturation, levels.black)
     if filters is None or (filters == "color") == SENSORS[sensor]:

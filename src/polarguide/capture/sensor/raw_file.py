@@ -1,4 +1,4 @@
-"""Read raw mosaics: pictures, arrays, and the packed pixels of GenICam and GigE Vision."""
+"""Read raw mosaics from pictures, arrays, and files with packed pixels of GenICam and GigE Vision."""
 
 from __future__ import annotations
 
@@ -9,10 +9,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polarguide.capture.formats.arrays import array_kind, read_array
-from polarguide.capture.formats.pictures import decode_stored, read_picture, stated_full_scale
+from polarguide.capture.formats.pictures import (
+    array_kind,
+    decode_stored,
+    read_array,
+    read_picture,
+    stated_full_scale,
+)
 from polarguide.capture.sensor.pattern import Packing
-from polarguide.core.errors import PolarguideError
+from polarguide.core.errors import PolarguideError, require
 from polarguide.core.files import read_file
 
 PACKINGS: dict[Packing, tuple[int, int, int]] = {
@@ -20,11 +25,11 @@ PACKINGS: dict[Packing, tuple[int, int, int]] = {
     "10p": (5, 4, 10), "10packed": (3, 2, 10), "10mipi": (5, 4, 10),
     "12p": (3, 2, 12), "12packed": (3, 2, 12), "12mipi": (3, 2, 12),
 }  # fmt: skip
-"""Bytes of a group, pixels of a group, bits of a pixel."""
+"""Bytes per group, pixels per group and bits per pixel by packing."""
 
 
 def packed_size(width: int, height: int, packing: Packing) -> int:
-    """Bytes of a packed picture: rows follow one another without padding, the last group is filled up."""
+    """Return the number of bytes of a packed picture. Rows have no padding; the last group is filled up."""
     group, pixels, _ = PACKINGS[packing]
     return -(-width * height // pixels) * group
 
@@ -44,7 +49,7 @@ def unpack(data: bytes, width: int, height: int, packing: Packing) -> NDArray[An
         packing: a key of ``PACKINGS``.
 
     Returns:
-        [height, width] values from 0 to 2^bits - 1, uint16 but for ``8``.
+        Values [height, width] from 0 to 2^bits - 1, uint16 except for ``8``.
     """
     group, pixels, bits = PACKINGS[packing]
     if pixels == 1:
@@ -70,19 +75,19 @@ RAW_SUFFIXES = (".png", ".tif", ".tiff", ".bmp", ".pgm", ".npy", ".raw")
 
 @dataclass(frozen=True)
 class RawFormat:
-    """Size and packing of a packed file, which does not contain them. Other files do not need them."""
+    """Size and packing of a packed file, which does not contain them. Other files need none."""
 
     width: int | None = None
     height: int | None = None
     packing: Packing | None = None
 
     def container(self, path: Path, kind: np.dtype[Any]) -> int:
-        """Bits that a pixel of type ``kind`` takes in a file."""
+        """Return the bits that a pixel of type ``kind`` takes in a file."""
         packing = self.packing if path.suffix.lower() == ".raw" else None
         return kind.itemsize * 8 if packing is None else PACKINGS[packing][2]
 
     def full_scale(self, path: Path, values: NDArray[Any]) -> int | None:
-        """The full scale that a file states for its values [H, W], as ``stated_full_scale``."""
+        """Return the full scale that a file states for its values [H, W], see ``stated_full_scale``."""
         if path.suffix.lower() in (".raw", ".npy"):
             return None
         with open(path, "rb") as file:
@@ -94,14 +99,14 @@ def read_mosaic(path: Path, raw: RawFormat, *, least: int = 1) -> NDArray[Any]:
 
     Args:
         path: a PNG, TIFF, ``.npy`` or packed ``.raw`` file.
-        raw: size and packing of a ``.raw`` file; where it gives a size, other files must have it too.
-        least: pixels that the shorter side must have.
+        raw: size and packing of a ``.raw`` file; other files must have this size as well.
+        least: smallest length of the shorter side in pixels.
 
     Returns:
-        [H, W] uint8 or uint16, the values as stored.
+        Stored values [H, W], uint8 or uint16.
 
     Raises:
-        PolarguideError: the file cannot be read, is damaged, has color channels or another size, is too small, or holds
+        PolarguideError: the file cannot be read, is damaged, has color channels or another size, is too small, or has
             four pictures.
     """
     packed = path.suffix.lower() == ".raw"
@@ -111,50 +116,49 @@ def read_mosaic(path: Path, raw: RawFormat, *, least: int = 1) -> NDArray[Any]:
 
 
 def require_mosaic(where: Path | str, values: NDArray[Any], *, least: int) -> None:
-    """Refuse values [H, W] that no sensor delivers; ``least``: pixels that the shorter side must have.
+    """Refuse values [H, W] that no sensor delivers; ``least`` is the smallest length of the shorter side.
 
     Raises:
-        PolarguideError: the values are too few, or four pictures side by side.
+        PolarguideError: the mosaic is too small, or consists of four pictures.
     """
-    if min(values.shape) < least:
-        raise PolarguideError(
-            where,
-            expected=f"a mosaic of at least {least}x{least} pixels",
-            found=f"{values.shape[1]}x{values.shape[0]}",
-            remedy="Give the whole picture of the sensor.",
-        )
-    if is_tiled(values):
-        raise PolarguideError(
-            where,
-            expected="a raw mosaic, in which the four angles take turns from pixel to pixel",
-            found="the same view four times, side by side",
-            remedy="Save what the sensor delivers (a pixel format such as Mono12 or BayerRG12), not one that shows the "
-            "four angles apart; or cut the file into four shots, NAME_0, NAME_45, NAME_90 and NAME_135.",
-        )
+    require(
+        min(values.shape) >= least,
+        where,
+        expected=f"a mosaic of at least {least}x{least} pixels",
+        found=f"{values.shape[1]}x{values.shape[0]}",
+        remedy="Use the whole picture of the sensor.",
+    )
+    require(
+        not is_tiled(values),
+        where,
+        expected="a raw mosaic, in which the four angles alternate from pixel to pixel",
+        found="the same view four times, side by side",
+        remedy="Save the output of the sensor (a pixel format such as Mono12 or BayerRG12), not one with separate "
+        "angles; or cut the file into four shots, NAME_0, NAME_45, NAME_90 and NAME_135.",
+    )
 
 
 def _read_plain(path: Path, raw: RawFormat) -> NDArray[Any]:
-    suffix = path.suffix.lower()
-    values = read_array(path) if suffix == ".npy" else decode_stored(path, read_picture(path))
+    values = read_array(path) if path.suffix.lower() == ".npy" else decode_stored(path, read_picture(path))
     if values.ndim == 3 and values.shape[2] == 1:
         values = values[..., 0]
     values = values.astype(values.dtype.newbyteorder("="), copy=False)
-    if values.ndim != 2 or values.dtype not in (np.uint8, np.uint16) or 0 in values.shape:
-        raise PolarguideError(
-            path,
-            expected="a raw mosaic: one channel of 8- or 16-bit whole numbers",
-            found=array_kind(values),
-            remedy="Save what the sensor delivers, before any demosaicing or conversion to color.",
-        )
-    found = (values.shape[1], values.shape[0])
-    wanted = (raw.width or found[0], raw.height or found[1])
-    if found != wanted:
-        raise PolarguideError(
-            path,
-            expected=f"{wanted[0]}x{wanted[1]} pixels, as --width and --height say",
-            found=f"{found[0]}x{found[1]}",
-            remedy="Leave the two flags out for files that know their size.",
-        )
+    require(
+        values.ndim == 2 and values.dtype in (np.uint8, np.uint16) and 0 not in values.shape,
+        path,
+        expected="a raw mosaic: one channel of 8- or 16-bit whole numbers",
+        found=array_kind(values),
+        remedy="Save the output of the sensor before any demosaicing or conversion to color.",
+    )
+    size = (values.shape[1], values.shape[0])
+    expected = (raw.width or size[0], raw.height or size[1])
+    require(
+        size == expected,
+        path,
+        expected=f"{expected[0]}x{expected[1]} pixels, as specified by --width and --height",
+        found=f"{size[0]}x{size[1]}",
+        remedy="Omit the two options for files that state their size.",
+    )
     return values
 
 
@@ -165,35 +169,35 @@ def _read_packed(path: Path, data: bytes, raw: RawFormat) -> NDArray[Any]:
             path,
             expected="width, height and packing of a .raw file",
             found=f"no {', '.join(flag for flag, value in flags.items() if value is None)}",
-            remedy=f"Give them as the camera was set; packings are {', '.join(PACKINGS)} and are never guessed.",
+            remedy=f"Specify the settings of the camera; packings are {', '.join(PACKINGS)} and are never guessed.",
         )
     size = packed_size(raw.width, raw.height, raw.packing)
-    if len(data) != size:
-        raise PolarguideError(
-            path,
-            expected=f"{size} bytes for {raw.width}x{raw.height} pixels in {raw.packing}",
-            found=f"{len(data)}",
-            remedy="Check --width, --height and --packing; a file that is too short may be cut off.",
-        )
+    require(
+        len(data) == size,
+        path,
+        expected=f"{size} bytes for {raw.width}x{raw.height} pixels in {raw.packing}",
+        found=f"{len(data)}",
+        remedy="Check --width, --height and --packing; a short file may be truncated.",
+    )
     values = unpack(data, raw.width, raw.height, raw.packing)
-    _require_alike_neighbors(path, data, values, raw.packing)
+    _require_smooth(path, data, values, raw.packing)
     return values
 
 
 _CELLS = 4
-"""Pixels along a block whose mean is free of analyzers and colors on every sensor."""
+"""Side of the blocks in pixels. Their means do not depend on analyzers and colors on any sensor."""
 _LEAST_BLOCKS = 8
-"""Blocks along a quarter of the picture; fewer correlate by chance."""
+"""Smallest number of blocks along a quarter of the picture; fewer correlate by chance."""
 _MOST_BLOCKS = 128
-"""Blocks that are compared at most."""
+"""Largest number of compared blocks along a quarter."""
 _TILED = 0.4
-"""Correlation of the detail in every quarter with that in the first: over 0.55 of one view, 0.2 at most of others."""
+"""Correlation of the detail of all quarters with the first: over 0.55 for one view, up to 0.2 for other pictures."""
 
 
 def is_tiled(values: NDArray[Any]) -> bool:
-    """Whether a picture holds the same view four times, in two rows of two, as cameras show the four angles apart.
+    """Return True if a picture shows the same view four times, in two rows of two, as cameras display separate angles.
 
-    The detail (means of blocks less those of the blocks around) of each quarter is compared with that of the first.
+    The detail (block means minus the means of neighboring blocks) of each quarter is correlated with the first.
     """
     down, across = (min(side // 2 // _CELLS, _MOST_BLOCKS) for side in values.shape)
     if min(down, across) < _LEAST_BLOCKS:
@@ -202,11 +206,11 @@ def is_tiled(values: NDArray[Any]) -> bool:
     detail = []
     for row, column in ((0, 0), (0, half[1]), (half[0], 0), (half[0], half[1])):
         part = values[row : row + down * _CELLS, column : column + across * _CELLS]
-        # Sums of 16 values of 16 bits are whole numbers of 20, which single precision holds.
+        # Sums of 16 values of 16 bits are whole numbers of 20 bits, which single precision represents.
         rows = part.reshape(down, _CELLS, across * _CELLS).sum(axis=1, dtype=np.float32)
         means = rows.reshape(down, across, _CELLS).sum(axis=2).astype(np.float64) / _CELLS**2
         around = sum(np.roll(means, (y, x), (0, 1)) for y in (-1, 0, 1) for x in (-1, 0, 1))
-        # Logarithms of ratios: a quarter that is brighter everywhere has the same detail.
+        # Logarithms of ratios do not depend on the brightness of a quarter.
         fine = np.log((means + 1) / (around / 9 + 1))[1:-1, 1:-1].ravel()
         detail.append(fine - fine.mean())
     first, *others = (fine / max(float(np.linalg.norm(fine)), 1e-12) for fine in detail)
@@ -214,14 +218,15 @@ def is_tiled(values: NDArray[Any]) -> bool:
 
 
 _APART = 4
-"""Pixels after which analyzer and color are the same on every sensor."""
+"""Distance in pixels at which analyzer and color are the same on every sensor."""
 _ROUGHER = 2.0
-"""A reading whose neighbors differ this many times as much as those of another one is not how the file was written."""
+"""Ratio of roughness between two packings above which the rougher one is wrong."""
 
 
-def roughness(values: NDArray[Any]) -> float:
-    """Mean difference of neighbors behind one analyzer, as a share of that of samples that have nothing in common; of
-    the even or the odd columns, whichever is larger: a wrong packing may leave every other sample nearly right.
+def _worst_roughness(values: NDArray[Any]) -> float:
+    """Return the roughness of the even or odd columns, whichever is larger. A wrong packing may affect only one.
+
+    Roughness is the mean difference of neighbors behind one analyzer, relative to that of unrelated samples.
     """
     return max(_roughness(values[:, column::2]) for column in (0, 1))
 
@@ -236,17 +241,17 @@ def _roughness(columns: NDArray[Any]) -> float:
         np.abs(rows[..., apart:] - rows[..., :-apart]).mean() + np.abs(rows[:, 1] - rows[:, 0]).mean()
     ) / 2
     ordered = np.sort(rows, axis=None)
-    # The mean difference of any two of n samples, by their places in order (Gini).
+    # The mean difference of any two of n samples follows from their ranks (Gini).
     place = np.arange(1, ordered.size + 1, dtype=np.float64)
     spread = 2 * float((2 * place - ordered.size - 1) @ ordered) / ordered.size**2
     return float(near / spread) if spread > 0 else 0.0
 
 
-def _require_alike_neighbors(path: Path, data: bytes, values: NDArray[Any], packing: Packing) -> None:
-    """Refuse a packing or a size that makes noise of a picture, where another one of the same bytes does not.
+def _require_smooth(path: Path, data: bytes, values: NDArray[Any], packing: Packing) -> None:
+    """Refuse a packing or a size that gives noise, if another one of the same data gives a picture.
 
     Raises:
-        PolarguideError: there is such a one.
+        PolarguideError: another packing or size is right.
     """
     height, width = values.shape
     others: dict[str, tuple[int, int, Packing]] = {
@@ -256,14 +261,14 @@ def _require_alike_neighbors(path: Path, data: bytes, values: NDArray[Any], pack
     }
     if width != height:
         others[f"--width {height} --height {width}"] = (height, width, packing)
-    mine = roughness(values)
-    rough = {options: roughness(unpack(data, *other)) for options, other in others.items()}
-    # The smoothest one: of two packings that differ in the low bits alone, both are smooth.
+    own = _worst_roughness(values)
+    rough = {options: _worst_roughness(unpack(data, *other)) for options, other in others.items()}
+    # The smoothest one, because two packings that differ only in the low bits are both smooth.
     for options in sorted(rough, key=lambda options: rough[options])[:1]:
-        if mine > _ROUGHER * rough[options] > 0:
-            raise PolarguideError(
-                path,
-                expected="a picture, in which neighbors behind one analyzer are alike",
-                found=f"noise with --packing {packing} at {width}x{height}",
-                remedy=f"Read the file with {options}.",
-            )
+        require(
+            not own > _ROUGHER * rough[options] > 0,
+            path,
+            expected="a picture with similar neighbors behind one analyzer",
+            found=f"noise with --packing {packing} at {width}x{height}",
+            remedy=f"Read the file with {options}.",
+        )

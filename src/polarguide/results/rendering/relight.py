@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample, pad
 
-from polarguide.capture.formats.arrays import read_radiance
+from polarguide.capture.formats.pictures import read_radiance
 from polarguide.capture.presentation import in_camera
 from polarguide.core.errors import PolarguideError, optional_import
 from polarguide.core.files import atomic, in_utf8, write_whole

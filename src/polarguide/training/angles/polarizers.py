@@ -17,7 +17,7 @@ from torch import Tensor
 
 from polarguide import optics
 from polarguide.capture import Scene, View
-from polarguide.capture.angle_evidence import TO_DEVIATION, angle_difference, mean_angle, tolerance
+from polarguide.capture.angle_evidence import TO_DEVIATION, AngleEstimate, mean_angle
 from polarguide.capture.exposures import Exposure, with_estimate
 from polarguide.capture.view import ANGLES
 from polarguide.optics import Mount
@@ -214,28 +214,19 @@ class Judgment(FittedAngle):
         return self.tells and self.unexplained > self.rules.poor
 
     @property
-    def off(self) -> float:
-        """Degrees from the specified to the fitted angle, in [-90, 90); 0 without a specified angle."""
-        return 0.0 if self.specified.angle is None else angle_difference(self.angle, self.specified.angle)
-
-    @property
-    def limit(self) -> float:
-        """Degrees of deviation beyond which a picture contradicts its specified angle.
-
-        It grows with the deviations of the other pictures, since large deviations of all pictures mean a wrong model.
-        From 90 on, no picture contradicts.
-        """
-        return tolerance(self.rules.contradicts, self.spread, self.usual)
+    def estimate(self) -> AngleEstimate:
+        """Comparison of the fitted angle with the specified one."""
+        floor = self.rules.contradicts
+        return AngleEstimate(self.angle, self.spread, self.specified.angle, floor, self.usual)
 
     @property
     def contradicts(self) -> bool:
-        """True if the picture contradicts its specified angle by more than its ``limit``."""
-        return not (self.unfiltered or self.overruled) and abs(self.off) > self.limit
+        """True if the picture contradicts its specified angle."""
+        return not (self.unfiltered or self.overruled) and self.estimate.contradicts
 
     def resembles(self, other: Judgment) -> bool:
         """Return True if the fitted angle equals the specified angle of another picture, within its spread."""
-        apart = angle_difference(self.angle, other.specified.angle or 0.0)
-        return abs(apart) <= tolerance(self.rules.contradicts, self.spread)
+        return not replace(self.estimate, stated=other.specified.angle or 0.0, usual=0.0).contradicts
 
     @property
     def doubtful(self) -> bool:
@@ -415,7 +406,7 @@ class Polarizers:
             )
             for (view, k), row in zip(self._places, fit.tolist(), strict=True)
         ]
-        offs = [abs(row.off) for row in rows if row.tells and row.specified.angle is not None]
+        offs = [abs(row.estimate.off) for row in rows if row.tells and row.specified.angle is not None]
         usual = median(offs) if offs else 0.0
         return [replace(row, usual=usual) for row in rows]
 
