@@ -14,8 +14,7 @@ from polarguide.core.errors import PolarguideError
 from polarguide.core.files import read_file
 from polarguide.core.options import PathLike, SceneOptions, index_of
 from polarguide.core.progress import SILENT, Reporter
-from polarguide.results.rendering.pictures import views_named
-from polarguide.results.rendering.priors import write_priors
+from polarguide.results.rendering.pictures import views_named, write_priors
 from polarguide.runs.opened import OpenedRun, read_scene
 from polarguide_shots.calibration.calibrate import calibrate_sensor
 from polarguide_shots.measurement.line import measure_shots
@@ -50,7 +49,7 @@ def priors(
     Args:
         scene: a scene with poses, or its folder.
         out: folder to write.
-        run, views, threshold: see ``results.rendering.priors.write_priors``.
+        run, views, threshold: see ``results.rendering.pictures.write_priors``.
         refractive_index: refractive index of the surfaces; None: the value in ``scene.json``, else 1.5.
         reading: options of reading a scene folder.
         formats: formats of the maps of ``shot_priors`` (png, exr, npy, page), written to a folder for each view.

@@ -59,7 +59,8 @@ def test_scores_are_made_there_and_read_once_a_view(elsewhere: Path) -> None:
         here = score_view(ViewTarget.of_view(view, facts, cpu), result.to("cpu"), **given)
         with pytest.raises(RuntimeError, match="mixes devices"):
             score_view(ViewTarget.of_view(view, facts, cpu), result)
-    assert there == here == record["views"][view.name]
+    without_coverage = {key: None for key in there if "seen" in key}
+    assert there == here == {**record["views"][view.name], **without_coverage}
     by_cpu = open_run(elsewhere, device="cpu").evaluate()
     assert record["psnr"] == pytest.approx(by_cpu["psnr"], abs=0.01)
     assert record["specular_psnr"] == pytest.approx(by_cpu["specular_psnr"], abs=0.01)

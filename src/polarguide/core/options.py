@@ -44,7 +44,7 @@ BaseColor = Literal["delit", "diffuse", "photographs", "picture"]
 PictureFormat = Literal["png", "exr", "npy"]
 EXPORT_PACKAGES: dict[str, tuple[str, ...]] = {
     "spz": ("gaussforge",),
-    "mesh": ("skimage", "trimesh"),
+    "mesh": ("skimage",),
     **dict.fromkeys(("glb", "obj"), ("skimage", "xatlas", "fast_simplification")),
     "all": ("gaussforge", "skimage", "xatlas", "fast_simplification"),
     "usdz": ("pxr", "skimage", "xatlas", "fast_simplification"),

@@ -23,8 +23,7 @@ from polarguide.geometry.vectors import dot, unit
 from polarguide.raster import Rasterize
 from polarguide.shading.gbuffer import splats
 from polarguide.training.metals.observations import shares
-from polarguide.viewer.panel import BRUSH, OFF, Panel
-from polarguide.viewer.presenting import Clicks
+from polarguide.viewer.panel import BRUSH, OFF, Clicks, Panel
 from polarguide.visualization.figures import Picture
 
 ASK = "Click on a surface"

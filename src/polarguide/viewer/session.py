@@ -27,8 +27,7 @@ from polarguide.viewer.cameras import (
     path_json,
 )
 from polarguide.viewer.painting import Paintable, Painting
-from polarguide.viewer.panel import FREE_VIEW, Panel, PanelOptions
-from polarguide.viewer.presenting import Presenting
+from polarguide.viewer.panel import FREE_VIEW, Panel, PanelOptions, Presenting
 from polarguide.viewer.scenery import Painter, Scenery
 from polarguide.visualization.figures import png_bytes
 

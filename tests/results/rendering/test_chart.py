@@ -28,8 +28,7 @@ from polarguide.gaussians.harmonics import sh_basis
 from polarguide.gaussians.ply import read_ply
 from polarguide.geometry.camera import Camera
 from polarguide.optics.color import srgb_decode
-from polarguide.results.rendering.chart import LAB, XYZ_OF_SRGB, chart_of
-from polarguide.results.rendering.present import presentation_lines
+from polarguide.results.rendering.present import LAB, XYZ_OF_SRGB, chart_of, presentation_lines
 from polarguide.results.rendering.relight import read_panorama
 
 # Of a camera whose green is strong and whose channels overlap.

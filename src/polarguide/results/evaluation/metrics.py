@@ -283,8 +283,8 @@ def seen_share(pred: Tensor, seen: Selection, valid: Selection) -> Tensor:
         seen: valid pixels whose content a training view shows.
         valid: the pixels that count.
     """
-    count = pred.new_tensor(len(valid.places), dtype=torch.float64)
-    return len(seen.places) / torch.where(count > 0, count, torch.nan)
+    share = len(seen.places) / len(valid.places) if len(valid.places) else math.nan
+    return pred.new_full((), share, dtype=torch.float64)
 
 
 def coverage_error(alpha: Tensor, mask: Tensor, keep: Selection) -> Tensor:

@@ -38,7 +38,7 @@ class PageShading:
 
     Attributes:
         kind: preprocessor symbol of the page's shaders, in lower case.
-        values: values per Gaussian, [N, ...], by the names of ``results.export.share.SLOTS``.
+        values: values per Gaussian, [N, ...], by the names of ``results.export.web_page.SLOTS``.
         light: cubemaps [6, R, R, C], finest first.
         network: matrices [rows, columns] in the order of the shaders.
         constants: additional entries of the page's scene, plain JSON values.

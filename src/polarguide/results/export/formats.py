@@ -50,13 +50,13 @@ from polarguide.results.export.placement import (
     SUFFIX,
     Origin,
     Placement,
+    Presented,
     comments,
     rewrite_splats,
     transforms,
     write_colmap,
     write_transforms,
 )
-from polarguide.results.export.presented import Presented
 from polarguide.results.export.splats import COLOR_SPACES, Encoding, write_sog, write_splat_glb, write_spz
 from polarguide.results.export.usd import write_splat_usdz, write_usdz
 from polarguide.results.rendering.mesh import RESOLUTION, scene_mesh
@@ -289,7 +289,10 @@ class _Exporter:
 
     def spz(self) -> list[Path]:
         """Write SPZ in units of the scene, because the format rounds positions to 1/4096 of a unit."""
-        placement = replace(self.presented.placement, scale=1.0, metric=False)
+        # Readers expect +y up and revert this half turn.
+        half_turn = torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))
+        rotation = half_turn @ self.presented.placement.rotation
+        placement = replace(self.presented.placement, rotation=rotation, scale=1.0, metric=False)
         return self._from_ply("splats.spz", partial(write_spz, version=self.spz_version), placement)
 
     def sog(self) -> list[Path]:

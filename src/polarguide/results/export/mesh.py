@@ -9,17 +9,19 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.lib.recfunctions import unstructured_to_structured
+from numpy.typing import NDArray
 from plyfile import PlyData, PlyElement
 from torch import Tensor
 
 from polarguide.capture import View
-from polarguide.core.errors import PolarguideError, optional_import
-from polarguide.core.files import atomic, write_whole
+from polarguide.core.errors import PolarguideError
+from polarguide.core.files import atomic
 from polarguide.gaussians.gaussians import CORE_SHAPES
 from polarguide.gaussians.geometry import shortest_axis_normals
 from polarguide.geometry.scene_frame import SceneFrame
 from polarguide.optics.color import srgb_encode
 from polarguide.raster import Rasterize
+from polarguide.results.export.model.gltf import ELEMENTS, Binary
 from polarguide.results.export.placement import (
     GENERATOR,
     IN_PLACE,
@@ -27,7 +29,6 @@ from polarguide.results.export.placement import (
     Origin,
     Placement,
     comments,
-    with_comments,
 )
 from polarguide.results.rendering.mesh import ColoredMesh
 from polarguide.shading.gbuffer import diffuse_colors
@@ -48,44 +49,27 @@ def write_mesh(
         path: the file, .ply or .glb. mesh: the mesh in the scene's axes. around: the scene's frame.
         placement: placement of the PLY. The GLB uses only its scale.
         origin: author and provenance.
-
-    Raises:
-        PolarguideError: trimesh is not installed.
     """
-    trimesh = optional_import("trimesh", "--format mesh")
-    binary = path.suffix.lower() == ".glb"
-    colors = torch.from_numpy(mesh.colors)
-    values = (colors if binary else srgb_encode(colors)).mul(255).round().to(torch.uint8).numpy()
-    vertices, normals = (torch.from_numpy(t) for t in (mesh.surface.vertices, mesh.surface.normals))
-    if binary:
-        vertices = placement.scale * vertices
-    else:
-        vertices = placement.points(vertices)
-        normals = placement.directions(normals)
-    solid = trimesh.Trimesh(
-        vertices=vertices.numpy(),
-        faces=mesh.surface.faces,
-        vertex_normals=normals.numpy(),
-        vertex_colors=np.concatenate((values, np.full((len(values), 1), 255, np.uint8)), axis=1),
-        process=False,
-        validate=False,
-    )
-    if binary:
-        pose = np.eye(4)
-        pose[:3, :3] = around.panorama_axes().T.numpy()
-        scene = trimesh.Scene()
-        scene.add_geometry(solid, node_name="mesh", geom_name="mesh", transform=pose)
-
-        def about(tree: dict[str, Any]) -> None:
-            tree["asset"] |= asset_record(placement, origin)
-            # The default material of glTF is a rough metal, which shows no diffuse color.
-            tree["materials"] = [{"name": "diffuse", "pbrMetallicRoughness": DIELECTRIC}]
-            tree["meshes"][0]["primitives"][0]["material"] = 0
-
-        data = scene.export(file_type="glb", include_normals=True, tree_postprocessor=about)
-    else:
-        data = with_comments(solid.export(file_type="ply", vertex_normal=True), comments(origin, placement))
-    write_whole(path, data)
+    surface = mesh.surface
+    if path.suffix.lower() == ".glb":
+        axes = around.panorama_axes().numpy()
+        rgba = np.rint(255 * np.pad(mesh.colors, ((0, 0), (0, 1)), constant_values=1))
+        binary = Binary()
+        attributes = {
+            "POSITION": binary.array((placement.scale * surface.vertices @ axes).astype("<f4"), bounds=True),
+            "NORMAL": binary.array((surface.normals @ axes).astype("<f4")),
+            "COLOR_0": binary.array(rgba.astype("u1")),
+        }
+        faces = binary.array(surface.faces.reshape(-1).astype("<u4"), ELEMENTS)
+        primitive = {"attributes": attributes, "indices": faces, "material": 0}
+        # The default material of glTF is a rough metal, which shows no diffuse color.
+        material = {"name": "diffuse", "pbrMetallicRoughness": DIELECTRIC}
+        binary.write(path, asset_record(placement, origin), primitive, {"materials": [material]})
+        return
+    points = placement.points(torch.from_numpy(surface.vertices))
+    normals = placement.directions(torch.from_numpy(surface.normals))
+    colors = srgb_encode(torch.from_numpy(mesh.colors))
+    write_points(path, points, normals, colors, comments(origin, placement), surface.faces)
 
 
 def asset_record(placement: Placement, origin: Origin) -> dict[str, Any]:
@@ -141,15 +125,24 @@ def surface_points(
 
 
 def write_points(
-    path: Path, points: Tensor, normals: Tensor, colors: Tensor, comments: Sequence[str] = ()
+    path: Path,
+    points: Tensor,
+    normals: Tensor,
+    colors: Tensor,
+    comments: Sequence[str] = (),
+    faces: NDArray[np.int64] | None = None,
 ) -> None:
     """Write a PLY of points with comments.
 
     Args:
         path: the file. points, normals: [M, 3]. colors: [M, 3] encoded, in [0, 1].
+        comments: lines of the header. faces: [F, 3] of a mesh; None for a point cloud.
     """
     values = np.concatenate((points.numpy(), normals.numpy(), np.rint(colors.numpy() * 255)), axis=1)
     table = unstructured_to_structured(values, np.dtype(FIELDS))
+    elements = [PlyElement.describe(table, "vertex", comments=list(comments))]
+    if faces is not None:
+        rows = faces.astype("<i4").view([("vertex_indices", "<i4", (3,))])[:, 0]
+        elements.append(PlyElement.describe(rows, "face"))
     with atomic(path) as temporary:
-        element = PlyElement.describe(table, "vertex", comments=list(comments))
-        PlyData([element], byte_order="<").write(temporary)
+        PlyData(elements, byte_order="<").write(temporary)

@@ -1,13 +1,13 @@
-"""Axes, units and comments of exported files, and camera poses for other programs."""
+"""Presentation of a run in exported files: subject, axes, units, comments, provenance, and camera poses."""
 
 from __future__ import annotations
 
 import json
 import math
-import re
 import unicodedata
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,15 +21,20 @@ from torch import Tensor
 
 from polarguide import __version__
 from polarguide.capture.presentation import Presentation
+from polarguide.core.errors import PolarguideError, PolarguideWarning
 from polarguide.core.files import atomic, atomic_folder, write_text
+from polarguide.core.options import Axes
+from polarguide.core.progress import SILENT, Reporter
 from polarguide.gaussians.harmonics import sh_basis
 from polarguide.gaussians.ply import REST_COUNT
 from polarguide.geometry.camera import Camera
 from polarguide.geometry.scene_frame import SceneFrame
 from polarguide.geometry.vectors import spread_directions
-
-HARMONICS = ("f_rest", "linear_rest")
-"""Fields of harmonics in our PLY files. The first is channel-major, the second has the channel last."""
+from polarguide.results.rendering.subject import Subject, subject_of
+from polarguide.runs.opened import OpenedRun
+from polarguide.shading.gbuffer import RenderRequest, render
+from polarguide.shading.model import Parameters
+from polarguide.shading.result import RenderResult
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,9 +70,14 @@ class Placement:
         return cls(rotation, scale or 1.0, scale is not None, around is not None)
 
     @property
+    def rotates(self) -> bool:
+        """True if the axes of the file differ from the scene's."""
+        return not torch.equal(self.rotation, torch.eye(3, dtype=torch.float64))
+
+    @property
     def changes(self) -> bool:
         """True if the placement is not the identity."""
-        return self.upright or self.scale != 1.0
+        return self.rotates or self.scale != 1.0
 
     def points(self, places: Tensor) -> Tensor:
         """Convert points [N, 3] of the scene to the file."""
@@ -97,31 +107,24 @@ class Placement:
         """Transform the Gaussians of a PLY, a structured array in the layout of ``write_ply``, in place."""
         if not self.changes:
             return
-        for fields, scale in ((("x", "y", "z"), self.scale), (("nx", "ny", "nz"), 1.0)):
-            values = np.stack([table[name] for name in fields], axis=1).astype(np.float64)
-            for name, column in zip(fields, (scale * values @ self.rotation.numpy().T).T, strict=True):
-                table[name] = column
+        rotation = self.rotation.numpy()
+        _transform(table, ["x", "y", "z"], self.scale * rotation)
+        _transform(table, ["nx", "ny", "nz"], rotation)
         for k in range(3):
             table[f"scale_{k}"] += math.log(self.scale)
-        if not self.upright:
+        if not self.rotates:
             return
-        quaternions = np.stack([table[f"rot_{k}"] for k in (1, 2, 3, 0)], axis=1).astype(np.float64)
-        rotated = Rotation.from_matrix(self.rotation.numpy()) * Rotation.from_quat(quaternions)
-        for k, column in enumerate(rotated.as_quat().T[[3, 0, 1, 2]]):
-            table[f"rot_{k}"] = column
+        names = [f"rot_{k}" for k in (1, 2, 3, 0)]
+        quaternions = np.stack([table[name] for name in names], axis=1).astype(np.float64)
+        rotated = Rotation.from_matrix(rotation) * Rotation.from_quat(quaternions)
+        for name, column in zip(names, rotated.as_quat().T, strict=True):
+            table[name] = column
         matrix = self.harmonics()
-        names = table.dtype.names or ()
-        for field in HARMONICS:
-            if f"{field}_{3 * REST_COUNT - 1}" not in names:
-                continue
-            for channel in range(3):
-                places = [
-                    f"{field}_{channel * REST_COUNT + k if field == 'f_rest' else 3 * k + channel}"
-                    for k in range(REST_COUNT)
-                ]
-                values = np.stack([table[name] for name in places]).astype(np.float64)
-                for name, column in zip(places, matrix @ values, strict=True):
-                    table[name] = column
+        for channel in range(3):
+            # f_rest is channel-major; linear_rest has the channel last.
+            _transform(table, [f"f_rest_{channel * REST_COUNT + k}" for k in range(REST_COUNT)], matrix)
+            if "linear_rest_0" in (table.dtype.names or ()):
+                _transform(table, [f"linear_rest_{3 * k + channel}" for k in range(REST_COUNT)], matrix)
 
     def record(self) -> dict[str, Any]:
         """Return the record in exported files: ``units``, ``up_axis``, rotation and scale of the scene."""
@@ -131,6 +134,13 @@ class Placement:
             **({"meters_per_unit_of_scene": self.scale} if self.metric else {}),
             **({"rotation_of_scene": self.rotation.flatten().tolist()} if self.upright else {}),
         }
+
+
+def _transform(table: NDArray[Any], names: Sequence[str], matrix: NDArray[np.float64]) -> None:
+    """Multiply the vectors in some fields of a structured array by a matrix, in place."""
+    values = np.stack([table[name] for name in names]).astype(np.float64)
+    for name, column in zip(names, matrix @ values, strict=True):
+        table[name] = column
 
 
 @dataclass(frozen=True)
@@ -174,14 +184,6 @@ def _ascii(value: Any) -> str:
     decomposed = unicodedata.normalize("NFKD", text.replace("©", "(c)"))
     plain = "".join(character for character in decomposed if not unicodedata.combining(character))
     return plain.encode("ascii", "backslashreplace").decode()
-
-
-def with_comments(ply: bytes, lines: list[str]) -> bytes:
-    """Insert comments into a PLY file after the line of its first element, which SIBR expects as third line."""
-    match = re.search(rb"^element [^\n]*\n", ply, re.MULTILINE)
-    assert match is not None
-    added = "".join(f"comment {line}\n" for line in lines).encode("ascii")
-    return ply[: match.end()] + added + ply[match.end() :]
 
 
 def rewrite_splats(path: Path, ply: Path, placement: Placement, mask: Tensor, lines: list[str]) -> None:
@@ -284,3 +286,109 @@ def write_transforms(path: Path, cameras: Mapping[str, Camera], about: Mapping[s
         path: the file. cameras: cameras by view. about: additional fields, which readers ignore.
     """
     write_text(path, json.dumps({**transforms(cameras), **about}, indent=1) + "\n")
+
+
+ALL = Subject(None, "everything")
+"""The whole scene as a subject."""
+
+
+class Presented:
+    """Presentation of a run: the Gaussians of its subject, their placement, and the provenance of files.
+
+    If the scene is missing, the up axis and the subject are unknown. Then all Gaussians are exported in the
+    scene's own axes, with a warning.
+
+    Args:
+        run: the run. axes: axes of the placement. masked: see ``subject_of``.
+        reporter: receives a line about removed Gaussians.
+
+    Raises:
+        PolarguideError: the presentation cannot be read, or no Gaussian belongs to the subject.
+    """
+
+    def __init__(
+        self,
+        run: OpenedRun,
+        *,
+        axes: Axes = "upright",
+        masked: bool = False,
+        reporter: Reporter = SILENT,
+    ) -> None:
+        self.presentation = run.presentation
+        self.subject = ALL
+        self.poses = self._known_poses(run)
+        if self.poses is not None or self.presentation.crop is not None:
+            self.subject = subject_of(run, masked=masked)
+        model = run.model
+        self.inside = self._members(run, reporter)
+        self.gaussians: Parameters = model.state.gaussians.only(self.inside)
+        footprints = model.state.footprints
+        self.footprints = None if footprints is None else footprints[self.inside]
+        chosen = self.presentation.up_axis is not None
+        around = run.frame if chosen or (axes == "upright" and self.poses is not None) else None
+        self.placement = Placement.of(self.presentation, around)
+        scene = run.configuration.scene_digest[:12]
+        made_of = (
+            f"{run.recipe.name}, {run.steps} steps, scene sha256 {scene}, polarization {run.polarization}"
+        )
+        self.origin = Origin(self.presentation, made_of)
+
+    @staticmethod
+    def _known_poses(run: OpenedRun) -> list[Camera] | None:
+        """Return the scene's cameras, or None with a warning if the scene is missing."""
+        if run.scene_is_there:
+            return [*run.poses.values()]
+        warnings.warn(
+            f"The scene of {run.folder} is no longer at {run.scene_folder}: files have its own axes and contain all "
+            "Gaussians, and normals point away from the center of the Gaussians instead of to the nearest camera. "
+            f"{run.new_place}",
+            PolarguideWarning,
+            stacklevel=5,
+        )
+        return None
+
+    def _members(self, run: OpenedRun, reporter: Reporter) -> Tensor:
+        """Return the Gaussians that belong to the subject, [N] bool."""
+        inside = self.subject.holds(run.model.state.gaussians["means"])
+        count = int(inside.sum())
+        if not count:
+            raise PolarguideError(
+                "the crop box" if self.presentation.crop is not None else "the subject",
+                expected=f"Gaussians inside ({self.subject.description})",
+                found=f"none of {len(inside)}",
+                remedy="Move the box with polarguide present RUN --crop or in polarguide view.",
+            )
+        self.subject.report_removed(inside, run, reporter)
+        return inside
+
+    @property
+    def centers(self) -> Tensor | None:
+        """Centers of the scene's cameras [M, 3] for the orientation of surfaces; None if unknown."""
+        return None if self.poses is None else torch.stack([camera.center for camera in self.poses])
+
+    def upright(self, run: OpenedRun) -> Placement:
+        """Return the placement for formats with +y up."""
+        axes = run.frame.panorama_axes()
+        return replace(self.placement, rotation=axes.T, upright=True)
+
+    @property
+    def comments(self) -> list[str]:
+        """Comments for the header of a file."""
+        return comments(self.origin, self.placement)
+
+    def surface_view(self, run: OpenedRun) -> Callable[[Camera], RenderResult]:
+        """Return a function that renders the Gaussians of the subject with the surface at the median depth."""
+        model = run.model
+
+        @torch.no_grad()
+        def surface_view(camera: Camera) -> RenderResult:
+            return render(
+                self.gaussians,
+                camera,
+                model.backend.rasterize,
+                RenderRequest(depth=True, at_median_depth=True),
+                shading=model.shading,
+                light=model.light,
+            )
+
+        return surface_view

@@ -6,9 +6,9 @@ https://developer.playcanvas.com/user-manual/gaussian-splatting/formats/sog
 We write SOG ourselves, because GaussForge 0.6 writes 65,000 Gaussians in eight seconds but did not finish
 88,623 in six minutes.
 
-glTF uses the extension ``KHR_gaussian_splatting`` (kernel ``ellipse``). It stores linear scales, opacities in [0, 1], quaternions (x, y, z, w) and the harmonics of 3DGS.
-Its ``colorSpace`` states the encoding of colors, but readers ignore it. So there is one file for each kind of
-reader.
+glTF uses the extension ``KHR_gaussian_splatting`` (kernel ``ellipse``). It stores linear scales, opacities in [0, 1],
+quaternions (x, y, z, w) and the harmonics of 3DGS. Its ``colorSpace`` states the encoding of colors, but readers ignore
+it. So there is one file for each kind of reader.
 """
 
 from __future__ import annotations
@@ -28,31 +28,27 @@ from torch import Tensor
 
 from polarguide.core.errors import PolarguideError, optional_import
 from polarguide.core.files import atomic, write_whole
-from polarguide.gaussians.ply import read_ply, write_ply
-from polarguide.results.export.glb import Binary
+from polarguide.gaussians.ply import read_ply
+from polarguide.results.export.model.gltf import Binary
 from polarguide.results.export.web_page import curve_places
-
-# Signs of the harmonics of degree 1 to 3, in the order of a PLY, after a half turn about x.
-_HALF_TURN_HARMONICS = (-1, -1, 1, -1, 1, 1, -1, 1, -1, 1, -1, -1, 1, -1, 1)
 
 
 def write_spz(path: Path, ply: Path, version: int = 3) -> None:
     """Convert a PLY of Gaussians to SPZ without our own fields.
 
-    The axes of SPZ are right, up and back. So the scene is rotated by 180 degrees about x, which readers of
-    SPZ revert. Positions are rounded to 1/4096 of a unit. Colors and scales have 8 bits, harmonics 5 or 4
-    bits by degree.
+    The axes of SPZ are right, up and back. Positions are rounded to 1/4096 of a unit. Colors and scales have 8 bits,
+    harmonics 5 or 4 bits by degree.
 
     Args:
         path: file to write.
-        ply: file from ``write_run_ply``.
+        ply: file from ``write_run_ply`` in the axes of SPZ.
         version: 3, or 4 (zstd instead of gzip).
 
     Raises:
         PolarguideError: the converter is not installed or cannot convert the file.
     """
     converter = optional_import("gaussforge", "--format spz").GaussForge()
-    converted = converter.convert(_half_turned(ply).read_bytes(), "ply", "spz", spz_version=version)
+    converted = converter.convert(ply.read_bytes(), "ply", "spz", spz_version=version)
     if "error" in converted:
         raise PolarguideError(
             ply,
@@ -61,19 +57,6 @@ def write_spz(path: Path, ply: Path, version: int = 3) -> None:
             remedy="Export to ply instead.",
         )
     write_whole(path, bytes(converted["data"]))
-
-
-def _half_turned(ply: Path) -> Path:
-    """Write the Gaussians, rotated by 180 degrees about the world's x, to a second file in the same folder."""
-    gaussians = read_ply(ply)
-    gaussians.pop("extra")
-    gaussians["means"] = gaussians["means"] * torch.tensor([1.0, -1.0, -1.0])
-    # The sign change also turns each Gaussian by 180 degrees about its own axis, which preserves its shape.
-    gaussians["quaternions"] = gaussians["quaternions"] * torch.tensor([1.0, 1.0, -1.0, -1.0])
-    gaussians["sh_rest"] = gaussians["sh_rest"] * torch.tensor(_HALF_TURN_HARMONICS)[None, :, None]
-    turned = ply.with_name("turned.ply")
-    write_ply(turned, **gaussians)
-    return turned
 
 
 CODES = 256

@@ -32,7 +32,7 @@ from polarguide.raster.interface import MINIMUM_ALPHA
 from polarguide.results.evaluation.record import METRICS_FILE, read_metrics
 from polarguide.results.evaluation.table import shown_metrics
 from polarguide.results.export.adapters import PageShading, page_shading
-from polarguide.results.export.presented import Presented
+from polarguide.results.export.placement import Presented
 from polarguide.runs.health import Health
 from polarguide.runs.model import baked_harmonics
 from polarguide.runs.opened import OpenedRun
@@ -228,7 +228,7 @@ class LayerTexts(NamedTuple):
 
 
 WORDS = {
-    "final": LayerTexts("picture", "the picture of a camera"),
+    "final": LayerTexts("picture", "a photograph from this pose"),
     "diffuse": LayerTexts("without gloss", "the color and shading of surfaces, without reflections"),
     "specular": LayerTexts("gloss alone", "only the reflections of surfaces"),
     "base": LayerTexts("below the gloss", "the color of the layer under the reflections"),
