@@ -51,7 +51,7 @@ def plain(text):
 def sentences(text):
     """Split a text into sentences; blank lines, list items and named entries separate them, too."""
     for block in re.split(r"\n\s*\n|\n\s*(?=[\w ,*`]+: )|\n\s*(?:[-*]|\d+\.) ", f"\n{text}"):
-        for sentence in re.split(r"(?<=[.!?;:])\s+(?=[A-Z0-9\"'(])", plain(block)):
+        for sentence in re.split(r"(?<=[.!?;:])\s+(?=[A-Z0-9\"'(*])", plain(block)):
             if sentence:
                 yield sentence
 
