@@ -368,11 +368,9 @@ def unusable_samples(
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Return masks of saturated and dark samples of a mosaic that starts with a whole polarizer cell.
 
-    A sample is saturated from ``levels.saturation``. It is dark if it is clipped at 0 below a black level, or if none
-    of
-    the four samples of its 2x2 cell exceeds black: then there is no light whose polarization could be measured. A
-        single
-    black angle next to brighter ones is valid, because surfaces at Brewster's angle look like this.
+    A sample is saturated from ``levels.saturation``. It is dark if it is clipped at 0 below a black level, or if no
+    sample of its 2x2 cell exceeds black: then there is no light whose polarization could be measured. A single black
+    angle next to brighter ones is valid, because surfaces at Brewster's angle look like this.
 
     Args:
         values: stored values [H, W], H and W even.

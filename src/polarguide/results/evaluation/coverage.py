@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -19,7 +19,8 @@ DEPTH_TOLERANCE = 1.02
 """Factor by which a point may lie behind the surface of a training view and still belong to it."""
 
 
-class DepthMap(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class DepthMap:
     """Depths of a view.
 
     Attributes:
