@@ -28,7 +28,7 @@ from polarguide.runs.folder import CONFIGURATION, RunConfiguration, load_checkpo
 from polarguide.runs.health import Health
 from polarguide.runs.model import GaussianModel, Within
 from polarguide.shading.result import LAYERS, POLARIZED, RenderResult, polarized_layers
-from polarguide.training.recipe import Recipe
+from polarguide.training.recipe import Recipe, values_differ
 from polarguide.training.settings import ResolvedSettings, TrainSettings
 
 Opened = TypeVar("Opened", bound="OpenedRun")
@@ -84,7 +84,7 @@ class OpenedRun:
         device: DeviceName = "auto",
         reporter: Reporter = SILENT,
     ) -> Opened:
-        """Open a run folder. Warns if the recipe has changed since the training.
+        """Open a run folder. Warns if the shading of the recipe has changed since the training.
 
         Args:
             folder: folder of a training.
@@ -105,10 +105,10 @@ class OpenedRun:
             raise PolarguideError("recipe", expected=expected, found=method.name, remedy=remedy)
         backend = choose_backend(device, say=reporter.say)
         state = load_checkpoint(folder, method, backend.device)
-        if method.differs(configuration.recipe_data):
+        if values_differ(method.shading.data(), configuration.recipe_data.get("shading", {})):
             _warn(
-                f"{folder} was trained with other values of the recipe {method.name} than those of this version, "
-                "which shades its pictures."
+                f"{folder} was trained with other shading values of the recipe {method.name} than those of this "
+                "version, which shades its pictures."
             )
         model = GaussianModel.of(state, method, configuration.settings, backend)
         return cls(folder, configuration, method, model, scene=scene, reporter=reporter)
