@@ -124,7 +124,8 @@ def test_a_build_for_cuda_without_a_gpu_is_named_with_its_size(
     assert doctor(capsys, 0)["notes"] == []
     monkeypatch.setattr(torch.version, "cuda", "13.0")
     (note,) = doctor(capsys, 0)["notes"]
-    assert "built for CUDA 13.0, and there is no GPU here: its libraries take 4.0 GB" in note
+    assert "built for CUDA 13.0" in note
+    assert "libraries take 4.0 GB" in note
     assert "pip uninstall -y torch nvidia-cublas triton; " in note
     assert "uv pip install --torch-backend=cpu torch" in note
     monkeypatch.setattr(shutil, "which", lambda _: "/usr/bin/nvidia-smi")

@@ -43,8 +43,7 @@ VERBS = {
     "calibrate": Verb(
         "polarguide_shots.verbs",
         "calibrate",
-        "Calibrate a polarization camera: what each of its polarizers really measures, from shots of "
-        "one before the lens.",
+        "Calibrate the polarizers of a polarization camera, from shots of a polarizer in front of the lens.",
     ),
     "scale": Verb(
         "polarguide_shots.verbs",
@@ -98,17 +97,17 @@ VERBS = {
     "export": Verb(
         "polarguide.cli.runs",
         "export_run",
-        "Write a run as the files of other programs.",
+        "Export a run to the file formats of other programs.",
     ),
     "priors": Verb(
         "polarguide_shots.verbs",
         "run_priors",
-        "Polarization maps of a shot, many shots or a scene: pictures, numbers and a page.",
+        "Write polarization maps of a shot, many shots or a scene: pictures, numbers and a page.",
     ),
     "measure": Verb(
         "polarguide_shots.verbs",
         "measure",
-        "A table of many shots for inspection lines: S0, DoLP and AoLP by region, limits, a golden part.",
+        "Measure many shots for inspection lines: S0, DoLP and AoLP by region, limits, a golden part.",
     ),
     "compare": Verb(
         "polarguide_bench.verbs",
