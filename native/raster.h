@@ -26,8 +26,8 @@ struct ProjectArgs {
     int64_t count;
     const float *means, *quaternions, *scales, *opacities; // [N,3] [N,4] [N,3] [N]
     PinholeCamera camera;
-    // Out. Rows of `screen`: x, y (pixels), A, B, C, L with log2(alpha) = A dx^2 + B dx dy + C dy^2 + L, then dy / dx of its maximum
-    // for a given dx, and dx / dy for a given dy.
+    // Output. A row of `screen` begins with x, y (pixels), A, B, C, L, where log2(alpha) = A dx^2 + B dx dy + C dy^2 + L.
+    // Its last two values are the slope dy / dx of the maximum for a given dx, and the slope dx / dy for a given dy.
     float *screen;  // [N,8]
     float *depth;   // [N]
     float *radius;  // [N] three standard deviations of the wider axis in pixels; 0 if culled
