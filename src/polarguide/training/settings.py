@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from polarguide.core.errors import PolarguideError
@@ -67,11 +67,11 @@ class TrainSettings:
     materials: Materials = "auto"
 
     def __post_init__(self) -> None:
-        _check_ranges(vars(self), least_gaussians=1)
+        _check_ranges(asdict(self), least_gaussians=1)
 
     def specified(self) -> dict[str, Any]:
         """Return the specified settings by name."""
-        values = {name: value for name, value in vars(self).items() if value is not None}
+        values = {name: value for name, value in asdict(self).items() if value is not None}
         if self.background == "auto":
             del values["background"]
         return values
@@ -96,11 +96,11 @@ class ResolvedSettings:
     materials: Materials = "auto"
 
     def __post_init__(self) -> None:
-        _check_ranges(vars(self), least_gaussians=0)
+        _check_ranges(asdict(self), least_gaussians=0)
 
     def fit(self, settings: TrainSettings) -> bool:
         """Return True if all specified settings have the same values."""
-        return settings.specified().items() <= vars(self).items()
+        return settings.specified().items() <= asdict(self).items()
 
 
 def _check_ranges(values: Mapping[str, Any], *, least_gaussians: int) -> None:
