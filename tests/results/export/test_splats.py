@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 from torch.nn.functional import normalize
 
 from polarguide.capture.presentation import Presentation
+from polarguide.core.errors import PolarguideWarning
 from polarguide.gaussians.geometry import quaternions_to_rotations, shortest_axis_normals
 from polarguide.gaussians.harmonics import evaluate_sh, sh_basis
 from polarguide.gaussians.ply import read_ply, write_ply
@@ -132,6 +133,21 @@ def test_both_versions_are_written_and_read(tmp_path: Path, version: int) -> Non
     (tmp_path / "back.ply").write_bytes(forge.convert(data, "spz", "ply")["data"])
     found, ours = read_ply(tmp_path / "back.ply"), read_ply(tmp_path / "run.ply")
     torch.testing.assert_close(found["means"], ours["means"], atol=1 / 4096, rtol=0)
+
+
+def test_positions_beyond_the_range_of_spz_are_left_out_with_a_warning(tmp_path: Path) -> None:
+    forge = pytest.importorskip("gaussforge").GaussForge()
+    state, shading = random_state("3dgs", 7)
+    means = state.gaussians["means"].detach()
+    means[2] = torch.tensor([0.0, -2100.0, 0.0])
+    write_run_ply(tmp_path / "run.ply", state, shading)
+    with pytest.warns(PolarguideWarning, match="1 of 7 Gaussians"):
+        write_spz(tmp_path / "run.spz", tmp_path / "run.ply")
+    data = forge.convert((tmp_path / "run.spz").read_bytes(), "spz", "ply")["data"]
+    (tmp_path / "back.ply").write_bytes(data)
+    found = read_ply(tmp_path / "back.ply")["means"]
+    expected = read_ply(tmp_path / "run.ply")["means"]
+    torch.testing.assert_close(found, expected[[0, 1, 3, 4, 5, 6]], atol=1 / 4096, rtol=0)
 
 
 MANY = 3000

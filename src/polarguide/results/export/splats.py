@@ -13,8 +13,10 @@ it. So there is one file for each kind of reader.
 
 from __future__ import annotations
 
+import io
 import json
 import math
+import warnings
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -24,17 +26,23 @@ import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from plyfile import PlyData, PlyElement
 from torch import Tensor
 
-from polarguide.core.errors import PolarguideError, optional_import
+from polarguide.core.errors import PolarguideError, PolarguideWarning, optional_import
 from polarguide.core.files import atomic, write_whole
 from polarguide.gaussians.ply import read_ply
 from polarguide.results.export.model.gltf import Binary
 from polarguide.results.export.web_page import curve_places
 
+SPZ_RANGE = 2047.0
+"""Largest absolute coordinate in SPZ. It has 24 bits with 12 fractional bits, and larger values wrap around."""
+
 
 def write_spz(path: Path, ply: Path, version: int = 3) -> None:
     """Convert a PLY of Gaussians to SPZ without our own fields.
+
+    Gaussians outside the range of SPZ are left out with a warning.
 
     The axes of SPZ are right, up and back. Positions are rounded to 1/4096 of a unit. Colors and scales have 8 bits,
     harmonics 5 or 4 bits by degree.
@@ -48,7 +56,20 @@ def write_spz(path: Path, ply: Path, version: int = 3) -> None:
         PolarguideError: the converter is not installed or cannot convert the file.
     """
     converter = optional_import("gaussforge", "--format spz").GaussForge()
-    converted = converter.convert(ply.read_bytes(), "ply", "spz", spz_version=version)
+    content = PlyData.read(ply)
+    vertices = content["vertex"].data
+    inside = np.all([np.abs(vertices[axis]) <= SPZ_RANGE for axis in "xyz"], axis=0)
+    if not inside.all():
+        warnings.warn(
+            f"{path}: SPZ has no positions beyond {SPZ_RANGE:g} units. {np.count_nonzero(~inside):,} of "
+            f"{len(inside):,} Gaussians are left out. Export to ply to keep them.",
+            PolarguideWarning,
+            stacklevel=2,
+        )
+        content = PlyData([PlyElement.describe(vertices[inside], "vertex")])
+    data = io.BytesIO()
+    content.write(data)
+    converted = converter.convert(data.getvalue(), "ply", "spz", spz_version=version)
     if "error" in converted:
         raise PolarguideError(
             ply,
