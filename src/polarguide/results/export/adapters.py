@@ -69,6 +69,8 @@ def _(shading: DeferredShading, gaussians: Parameters) -> dict[str, Tensor]:
     fields = ply_fields.dispatch(ShadingModel)(shading, gaussians)
     own = surface_channels(shading.surface, gaussians)
     fields.pop("index", None)
+    if "reflectance" in fields:
+        fields["reflectance"] = fields.pop("reflectance")  # keeps the order of earlier files
     if fields.pop("blur", None) is not None:
         blur = own["blur"][:, 0] if "blur" in own else torch.zeros_like(fields["strength"])
         fields["roughness"] = gltf_roughness(blur, shading.environment_resolution)
