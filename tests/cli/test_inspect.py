@@ -59,7 +59,7 @@ def test_a_capture_without_poses(unposed: Path, tmp_path: Path, capsys: pytest.C
     verdicts = {check["key"]: check["verdict"] for check in record["checks"]}
     assert record["schema"] == 2
     assert record["scene"]["posed_views"] == 0
-    for key in ("poses", "coverage", "view_exposure", "focal_lengths"):
+    for key in ("poses", "coverage", "view_exposure", "focal_lengths", "held_out"):
         assert verdicts.pop(key) == "n/a"
     for key in ("angle_order", "handedness", "zero_offset"):
         assert verdicts.pop(key) == "not verified"

@@ -95,7 +95,7 @@ def test_one_of_a_folder_that_cannot_be_read(tmp_path: Path, capsys: pytest.Capt
     arguments = ["--sensor", "IMX250MZR", "--out", str(tmp_path / "out"), "--formats", "npy"]
     assert run(["priors", str(tmp_path / "in"), *arguments]) == 2
     found = capsys.readouterr()
-    assert "expected 2 shots, found 1 that failed (b)" in found.err
+    assert "expected 2 shots, found 1 failed shots (b)" in found.err
     assert "b.png: expected a complete PNG" in found.out
     assert (tmp_path / "out" / "a" / "DoLP.npy").is_file()
 
@@ -109,6 +109,6 @@ def test_a_folder_with_ambiguous_files(tmp_path: Path, capsys: pytest.CaptureFix
     assert "one picture of cup at 45 degrees, found cup_45.png and cup_45.tif" in " ".join(
         printed.out.split()
     )
-    assert "expected 2 shots, found 1 that failed (cup)" in printed.err
+    assert "expected 2 shots, found 1 failed shots (cup)" in printed.err
     assert (tmp_path / "out" / "jar" / "DoLP.npy").is_file()
     assert not (tmp_path / "out" / "cup").exists()

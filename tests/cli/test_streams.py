@@ -224,7 +224,7 @@ def test_too_little_is_refused_before_a_picture_is_decoded(
     assert run(["train", str(demo_scene), "--out", str(tmp_path / "run"), *SHORT, "--memory", "30MB"]) == 2
     said = " ".join(capsys.readouterr().err.split())
     assert "--memory: expected at least" in said
-    assert "Give --memory" in said
+    assert "Use --memory" in said
     assert not (tmp_path / "run").exists()
 
 

@@ -187,7 +187,7 @@ def test_lines_that_are_none_of_ours_are_dropped(tmp_path: Path, line: str) -> N
 def test_one_training_at_a_time_writes_to_a_run(tmp_path: Path) -> None:
     run = tmp_path / "run"
     with writing_to(run):
-        Fault(str(run), "", "at work").raised_by(writing_to(run).__enter__)
+        Fault(str(run), "", "another training").raised_by(writing_to(run).__enter__)
         pid = os.fork()
         if not pid:  # another process
             try:
@@ -213,7 +213,7 @@ def test_a_second_training_into_a_run_is_refused(demo_scene: Path, tmp_path: Pat
     for folder in (run, old):
         given = {"settings": settings, "reading": reading, "resume": folder == old}
         with writing_to(folder):
-            Fault(found="at work").raised_by(polarguide.train, demo_scene, folder, **given)
+            Fault(found="another training").raised_by(polarguide.train, demo_scene, folder, **given)
     assert (old / CHECKPOINT).read_bytes() == before
 
 

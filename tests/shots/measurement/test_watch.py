@@ -182,7 +182,7 @@ def test_a_folder_of_an_angle_that_never_comes_is_told(tmp_path: Path) -> None:
     (parts / "135").rename(tmp_path / "135")
     watching = WatchOptions(settle=0.1, patience=0.2, idle=0.4)
     done = watch_folder(parts, tmp_path / "out", reading=PLAIN, watching=watching)
-    assert "four folders, for 0, 45, 90 and 135 degrees, found none for 135" in done.trouble
+    assert "none for 135" in done.trouble
     assert done.exit_status == 2
     (tmp_path / "135").rename(parts / "135")
     done = watch_folder(parts, tmp_path / "out", reading=PLAIN, watching=watching)
