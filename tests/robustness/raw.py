@@ -28,7 +28,7 @@ ANGLES = ("0", "45", "90", "135")
 CALIBRATED = f"{MOSAICS} --calibration calibration.json"
 
 reasons = {"noise": NOISE, "small": SIZES, "wide": SIZES, "turned": SIZES}
-warnings = {"black": "v001: .*black throughout", "white": "v001: 100% .*saturated"}
+warnings = {"black": "v001: .*completely black", "white": "v001: 100% .*saturated"}
 CASES += table(
     "mosaic", MOSAICS,
     *(Case(how, spoil.bytes_of(MOSAIC, how), passes=CHECKED, seeds=2, ci=how == "cut") for how in spoil.BYTES),

@@ -71,7 +71,7 @@ CASES += table(
         ("recipe", "a path", "../../outside", "", True),
         ("recipe_data.shading.model", "a program", "os.system", "", True),
       )),
-    Case("without test views", _set("test_views", to=[]), expected="test views to score", ci=True),
+    Case("without test views", _set("test_views", to=[]), expected="test view", ci=True),
     Case("with a version of a million letters", edit(RECORD, lambda given: given.replace(
         '"version": "', '"version": "' + "v" * 1_000_000)), RENDER, prints=r"\A.{,2000}\Z", ci=True),
     Case("with a key twice", TWICE, RENDER, found="occurs twice", ci=True),

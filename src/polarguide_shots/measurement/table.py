@@ -193,7 +193,7 @@ def _check(where: str, field: str, bound: Bound, reference: bool) -> None:
         PolarguideError: the field is unknown or needs a reference, or the bound is invalid.
     """
     near = " or ".join(difflib.get_close_matches(field, BOUNDED, 3, 0.5))
-    hint = f"Did you mean {near}?" if near else _REMEDY
+    hint = f"Similar fields are {near}." if near else _REMEDY
     _require(field in BOUNDED, where, "a field of the table", field, hint)
     _require(
         reference or field not in COMPARED,

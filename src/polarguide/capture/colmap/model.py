@@ -610,7 +610,7 @@ def require_sound(where: object, image: Any, camera: Any, tolerance: float) -> N
     """
     pose = image.cam_from_world()
     quaternion = np.asarray(pose.rotation.quat, np.float64)
-    length = float(np.linalg.norm(quaternion))
+    length = math.hypot(*quaternion)  # does not overflow
     require(
         not tolerance < abs(length - 1) < FARTHEST,
         where,
