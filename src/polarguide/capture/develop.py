@@ -602,7 +602,7 @@ class LinearShots:
         saturated: mask of the pixels that are saturated in some shot, [H, W].
         dark: mask of the pixels that are 0 in all shots, [H, W].
         outside: mask of the pixels that are outside the picture of some shot after the alignment, [H, W].
-        shifts: shifts of the shots that were corrected or found.
+        shifts: estimated shifts of the shots.
         orientation: EXIF orientation of the shots.
         clipped_share: share of the saturated pixels before the alignment.
         dark_share: share of the dark pixels before the alignment.
@@ -624,7 +624,7 @@ class LinearShots:
 
     @classmethod
     def of(cls, shots: Shots, transfer: str, *, align: bool) -> LinearShots:
-        """Convert the stored values of shots to linear intensities. If ``align`` is True, correct shifts of the shots."""
+        """Convert the stored values of shots to linear intensities, and correct shifts of the shots if ``align``."""
         values = linear_codes(shots.pictures, transfer).astype(np.float32) / np.float32(FULL_CODE)
         shifts = estimate_shifts(values) if align else [Shift(0.0, 0.0, True)] * len(values)
         values, (saturated, dark), outside = align_shots(values, (shots.clipped, shots.dark), shifts)

@@ -97,7 +97,7 @@ def masks_beside(root: Path, views: Mapping[str, int]) -> dict[str, Path]:
 
     Args:
         root: folder of the dataset.
-        views: numbers of the views by name.
+        views: number of each view by name.
     """
     pictures = index_files(root / "mask", SUFFIXES) or index_files(root / "masks", SUFFIXES)
     masks = {view: pictures[view] for view in views if view in pictures}

@@ -188,7 +188,7 @@ def _cameras(
         root: folder of the dataset.
         path: file of the cameras.
         views: number of each view by name.
-        pictures: folder of the pictures to which the intrinsics refer.
+        pictures: pictures to which the intrinsics refer, by name.
         light: a file of Stokes vectors. If the pictures were resized later, the intrinsics refer to the size of this
             file.
         offsets: possible offsets if the numbers of the views start at 0; None if they start at 1.
