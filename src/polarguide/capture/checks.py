@@ -68,7 +68,7 @@ class CheckLimits:
 # Curvature (see ``pair_slopes``) of encoded data taken as linear is about -0.6, of linear data decoded as sRGB about
 # +0.3; the gain differences of real sensors leave less than 0.1.
 ENCODED = (-0.12, -0.25)
-"""Two limits of the curvature of encoded files: they may be encoded below the first, and are encoded below the second."""
+"""Two limits for files that are not linear: they may be encoded below the first curvature, and are below the second."""
 DECODED = (0.1, 0.2)
 """Two limits for files that were decoded twice: they may be above the first curvature, and are above the second."""
 BENT = 0.05

@@ -265,7 +265,7 @@ def read_text_images(data: bytes) -> tuple[bytes, dict[int, str]]:
     """
     out: list[bytes] = []
     names: dict[int, str] = {}
-    number: int | None = None  # image whose observations are in the next line
+    number: int | None = None  # id of the image whose observations are in the next line
     for count, line in enumerate(data.splitlines(), 1):
         cells = line.split()
         if number is not None:

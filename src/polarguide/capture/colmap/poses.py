@@ -92,7 +92,7 @@ class Undistortion:
 
     @functools.cached_property
     def _map(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Return the x and the y coordinates in the source picture for each target pixel, in OpenCV's convention."""
+        """Coordinates x and y in the source picture for each target pixel, in OpenCV's convention."""
         rows, columns = np.mgrid[: self.target.height, : self.target.width]
         places = np.stack([columns.ravel() + 0.5, rows.ravel() + 0.5], axis=1)  # COLMAP's pixel centers
         rays = self.target.cam_from_img(places)
