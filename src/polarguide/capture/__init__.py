@@ -1,4 +1,4 @@
-"""Read a scene folder: views with four polarizer angles, a COLMAP model, ground truth."""
+"""Readers of captures: pictures at several polarizer angles, camera poses, and optional ground truth."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from polarguide.capture.scene import Scene, load_scene
     from polarguide.capture.view import View
 
-# Where each name is defined. It is loaded when it is asked for: a calibration can be read without torch.
+# Module of each public name. A module is imported when its name is first used, so some modules need no torch.
 _MODULES = {
     "ColmapModel": "colmap.model",
     "GroundTruth": "metadata",

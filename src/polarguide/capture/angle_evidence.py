@@ -1,6 +1,7 @@
-"""Evidence on polarizer angles: order, sense and zero of all pictures, and the angle of a single picture.
+"""Decide whether the stated polarizer angles are right, from several sources of evidence.
 
-This module decides on evidence from five sources.
+The functions estimate the order, sense and zero of the angles of all pictures, and the angle of a single picture. There
+are five sources of evidence.
 
 - **Pair sums** give the pairing, the pictures that are perpendicular to each other (``decide_pairing``).
 - **Outlines of masks** give the sense of views with Stokes vectors (``sense_of_outlines``).
@@ -37,33 +38,35 @@ from polarguide.capture.calibration import Sense
 from polarguide.geometry.polarizer import ANGLES
 
 TO_DEVIATION = 1.4826
-"""Standard deviation of normal errors over the median of their absolute values."""
+"""Ratio of the standard deviation of normally distributed errors to the median of their absolute values."""
 
 
 class AngleLimits:
-    """Constants of the models and decisions.
+    """Constants of the estimates and decisions.
 
     Attributes:
-        sure: standard errors by which a difference is certain. The short training of ``inspection.shots`` and the
-            curvature in ``inspection.picture_checks`` use 4, because their standard errors omit shared systematic
-            errors.
+        sure: number of standard errors above which a difference is certain. ``inspection.shots`` and
+            ``inspection.picture_checks`` use 4 instead, because their standard errors do not include systematic errors.
         decided: probability above which an order or a sense is decided.
-        zero_off: degrees of a wrong zero, and largest standard error of a zero with a verdict. Half of it gives a
-            warning.
-        pair_sums: largest residual of the best pairing over that of the second best.
-        outline_gain: smallest difference of the agreements of outlines with the two senses. Noise and outlines of
-            bodies that are not curved agree with neither sense.
-        outline_share: smallest share of views whose outlines agree on the sense.
-        alike: smallest length of the mean of (cos 2d, sin 2d), with d the differences of angles, that gives a common
+        zero_off: smallest error of a zero that is reported, in degrees. Half of it causes a warning. It is also the
+            largest standard error with which a zero is judged.
+        pair_sums: largest ratio of the smallest residual of a pairing to the second smallest with which the pairing is
+            decided.
+        outline_gain: smallest difference of the agreements of outlines with the two senses at which a view votes for
+            a sense. Noise and outlines of flat bodies agree with neither sense.
+        outline_share: smallest share of the views that must vote for the same sense.
+        alike: smallest length of the mean of (cos 2d, sin 2d) over the differences d of angles at which the pictures
+            have a common offset.
+        same_direction: length of the mean of doubled (or fourfold) stated angles above which the angles are too
+            similar to determine a sense.
+        outlier: largest distance from the mean difference in degrees at which a picture contributes to the common
             offset.
-        same_direction: length of the mean of doubled (or fourfold) stated angles above which they do not determine a
-            sense.
-        outlier: degrees from the mean difference beyond which a picture does not contribute to the common offset.
-        failure: prior probability that the model of a source of evidence does not hold (polarized light, ...).
-        cells: cells along the longest side of the box that contains the middle 90 % of the points.
-        least_error: smallest standard error of a zero in degrees; profiles have steps of one degree.
-        window: degrees around the zero of an order in which its maximum is searched.
-        groups: groups of clusters for jackknife errors.
+        failure: prior probability that the model of a source of evidence is wrong, for example because the light is
+            polarized.
+        cells: number of cells along the longest side of the box around the middle 90 % of the points.
+        least_error: smallest standard error of a zero in degrees, because profiles have steps of one degree.
+        window: largest distance in degrees from the zero of an order at which its maximum is searched.
+        groups: number of groups of clusters for jackknife errors.
     """
 
     sure = 3.0
@@ -91,10 +94,11 @@ def tolerance(floor: float, error: float, usual: float = 0.0, *, sigmas: float =
     """Return the largest difference in degrees that does not contradict a stated angle.
 
     Args:
-        floor: smallest difference that matters, degrees.
-        error: standard error of the estimate, degrees.
-        usual: median of the absolute differences of all pictures. Where all differ, the model is wrong.
-        sigmas: number of standard errors that count as chance.
+        floor: smallest difference in degrees that is reported.
+        error: standard error of the estimate in degrees.
+        usual: median of the absolute differences of all pictures in degrees. If all pictures differ, the model is
+            wrong, and not the angles.
+        sigmas: number of standard errors by which an estimate may differ by chance.
     """
     return max(floor, sigmas * error, sigmas * TO_DEVIATION * usual)
 
@@ -104,12 +108,12 @@ class AngleEstimate:
     """Estimate of the polarizer angle of one picture, compared with its stated angle.
 
     Attributes:
-        angle: estimated angle in degrees; None if the picture does not determine it.
-        error: standard error of the estimate, degrees.
+        angle: estimated angle in degrees; None if the picture does not determine the angle.
+        error: standard error of the estimate in degrees.
         stated: stated angle in degrees; None if it is unknown.
-        floor: smallest difference that matters, degrees.
-        usual: median of the absolute differences of all pictures, degrees.
-        sigmas: number of standard errors that count as chance.
+        floor: smallest difference in degrees that is reported.
+        usual: median of the absolute differences of all pictures in degrees.
+        sigmas: number of standard errors by which the estimate may differ by chance.
     """
 
     angle: float | None
@@ -121,13 +125,13 @@ class AngleEstimate:
 
     @property
     def off(self) -> float:
-        """Degrees from the stated to the estimated angle, in [-90, 90); 0 if one of them is unknown."""
+        """Estimated angle minus stated angle in degrees, in [-90, 90). It is 0 if one of the two is unknown."""
         unknown = self.angle is None or self.stated is None
         return 0.0 if unknown else float(angle_difference(self.angle, self.stated))
 
     @property
     def limit(self) -> float:
-        """Largest difference that does not contradict the stated angle, degrees."""
+        """Largest difference in degrees that does not contradict the stated angle."""
         return tolerance(self.floor, self.error, self.usual, sigmas=self.sigmas)
 
     @property
@@ -137,13 +141,18 @@ class AngleEstimate:
 
 
 def jackknife_error(estimate: Any, without: Any) -> Any:
-    """Return the standard error of an estimate [...] from the estimates without each of G groups, [G, ...]."""
+    """Compute the standard error of an estimate by the jackknife.
+
+    Args:
+        estimate: estimate from all data, [...].
+        without: estimates from the data without one group, for each of G groups, [G, ...].
+    """
     count = len(without)
     return np.sqrt(((np.asarray(without) - estimate) ** 2).sum(axis=0) * (count - 1) / count)
 
 
 def mean_angle(angles: Sequence[float], spreads: Sequence[float], least_spread: float) -> tuple[float, float]:
-    """Return the weighted mean of angles and their scatter, in degrees modulo 180.
+    """Return the weighted mean of angles modulo 180, and their scatter, both in degrees.
 
     The scatter is half the circular standard deviation of the doubled angles, sqrt(-2 log R) with R the length of their
     mean (Mardia and Jupp, Directional Statistics, 2.3).
@@ -163,10 +172,10 @@ def mean_angle(angles: Sequence[float], spreads: Sequence[float], least_spread: 
 
 
 class CommonRotation(NamedTuple):
-    """Sense and zero that turn stated angles into estimated ones: ``sense * stated + offset``.
+    """Rotation that relates the stated angles of all pictures to the estimated angles: ``sense * stated + offset``.
 
     Attributes:
-        sense: 1, -1 for the opposite sense, or None if neither agrees.
+        sense: 1 for the stated sense, -1 for the opposite sense, or None if neither explains the estimated angles.
         offset: offset of the zero in degrees.
         error: standard error of the offset in degrees.
     """
@@ -186,7 +195,7 @@ def common_rotation(estimated: Sequence[float], stated: Sequence[float]) -> Comm
     turn = turns[sense]
     if abs(turn.mean()) < AngleLimits.alike:
         return CommonRotation()
-    # The mean, then a second time without outliers.
+    # The mean is computed with all differences, and again without outliers.
     near = turn[np.abs(np.angle(turn / turn.mean())) < math.radians(2 * AngleLimits.outlier)]
     apart = np.degrees(np.angle(near / near.mean())) / 2
     error = float(TO_DEVIATION * np.median(np.abs(apart)) / math.sqrt(len(near)) * 1.25)
@@ -194,18 +203,25 @@ def common_rotation(estimated: Sequence[float], stated: Sequence[float]) -> Comm
 
 
 FileOrder = tuple[int, int, int, int]
-"""True angles of the pictures named 0, 45, 90 and 135 degrees."""
+"""True angle in degrees of each of the pictures named 0, 45, 90 and 135."""
 PAIRINGS: tuple[FileOrder, ...] = ((0, 45, 90, 135), (0, 90, 45, 135), (0, 45, 135, 90))
-"""One order for each pairing of the pictures, in the order of ``capture.checks.Measures.residuals``."""
+"""The three ways to form two pairs of perpendicular pictures. Each is represented by one order of the angles.
+
+``capture.checks.Measures.residuals`` has the same order.
+"""
 SENSES = (1, -1)
-"""Rows of an evidence profile."""
+"""Senses of the two rows of a profile in ``OrderEvidence``: counter-clockwise and clockwise."""
 
 
 def decide_pairing(residuals: NDArray[np.float64]) -> int | None:
-    """Return the pairing with by far the smallest residuals, an index into ``PAIRINGS``; None if undecided.
+    """Decide which pictures are perpendicular, from the residuals of the pair sums.
 
     Args:
         residuals: ``capture.checks.Measures.residuals`` of each view, [V, 3].
+
+    Returns:
+        Index into ``PAIRINGS`` of the pairing whose residuals are by far the smallest. It is None if no pairing is
+        clearly the best.
     """
     residuals = residuals[residuals.max(axis=1) > 0]
     if len(residuals) == 0:
@@ -224,11 +240,14 @@ _LEAST = 50
 
 
 class OutlineAgreement(NamedTuple):
-    """Agreement of the AoLP with the outline of one view's mask, for both senses.
+    """Agreement of the AoLP with the outline of one view's mask, for both senses of the angles.
+
+    An agreement is the mean of cos 4(angle - direction of the outline), weighted by the DoLP. It is 1 if the light is
+    polarized along or across the outline at every pixel, and 0 if the two directions are unrelated.
 
     Attributes:
-        ccw, cw: means of cos 4(angle - direction), weighted by the DoLP. 1 for polarization along or across the outline
-            at every pixel, 0 without a relation.
+        ccw: agreement if the angles increase counter-clockwise.
+        cw: agreement if the angles increase clockwise.
     """
 
     ccw: float
@@ -238,7 +257,7 @@ class OutlineAgreement(NamedTuple):
 def outline_agreement(
     stokes: NDArray[np.float32], mask: NDArray[np.bool_], zero: float = 0.0
 ) -> OutlineAgreement | None:
-    """Compare polarization and outline of a view; None for a mask with too little outline.
+    """Compare the polarization of a view with the outline of its mask. Return None if the outline is too short.
 
     At the outline of a curved body, the surface normal lies in the picture, across the outline. Diffuse light is
     polarized along this normal, and specular light across it. Both agree with the outline if the sense of the angles is
@@ -276,10 +295,10 @@ def outline_agreement(
 
 
 def sense_of_outlines(views: Sequence[OutlineAgreement]) -> Sense | None:
-    """Return the sense that the outlines of most views support clearly; None if undecided.
+    """Return the sense that the outlines of most views clearly support. Return None if they do not decide.
 
-    The threshold is a share of the views and not a number of standard errors: an outline without a curved body behind
-    it is a systematic error and not chance.
+    The threshold is a share of the views and not a number of standard errors. If a body is not curved at its outline,
+    the error is systematic, so it does not average out.
     """
     if not views:
         return None
@@ -293,18 +312,18 @@ def sense_of_outlines(views: Sequence[OutlineAgreement]) -> Sense | None:
 
 @dataclass(frozen=True)
 class Order:
-    """One of the eight orders within a pairing.
+    """One of the eight combinations of sense and zero that leave the pairs of perpendicular pictures unchanged.
 
     Attributes:
-        sense: +1 if the angles increase counter-clockwise as displayed, -1 if clockwise.
-        zero: direction of their zero, degrees counter-clockwise from the image's horizontal.
+        sense: +1 if the angles increase counter-clockwise as displayed, -1 if they increase clockwise.
+        zero: direction of angle zero in degrees, counter-clockwise from the picture's horizontal.
     """
 
     sense: int
     zero: int
 
     def files(self, pairing: FileOrder = ANGLES) -> FileOrder:
-        """Return the true angles of the pictures named 0, 45, 90 and 135."""
+        """Return the true angles of the pictures named 0, 45, 90 and 135 for an index into ``PAIRINGS``."""
         first, second, third, fourth = ((self.sense * angle + self.zero) % 180 for angle in pairing)
         return first, second, third, fourth
 
@@ -317,7 +336,7 @@ class Order:
 ORDERS: tuple[Order, ...] = tuple(Order(sense, zero) for sense in SENSES for zero in ANGLES)
 """All eight orders; the first is the identity."""
 IDENTITY = ORDERS[0]
-"""Order of correctly named pictures."""
+"""Order of pictures whose names state the true angles."""
 
 
 def swaps(files: FileOrder) -> str:
@@ -332,14 +351,15 @@ DEGREES = 180
 
 @dataclass(frozen=True, eq=False)
 class OrderEvidence:
-    """Log-likelihoods of one source of evidence.
+    """Log-likelihoods of all senses and zeros according to one source of evidence.
 
     Attributes:
         source: name of the source in messages.
-        clusters: [C, 2, 180] for the clusters, the senses +1 and -1, and zeros at 0, 1, ..., 179 degrees.
+        clusters: log-likelihoods of C spatial clusters, for the senses +1 and -1 and for zeros at 0, 1, ..., 179
+            degrees, [C, 2, 180].
         observations: number of pixels or observations.
-        usable: true if the quality suffices.
-        note: a sentence about the quality.
+        usable: True if the quality of the evidence is sufficient.
+        note: sentence for the user about the quality.
     """
 
     source: str
@@ -372,28 +392,28 @@ class OrderPosterior:
 
     @property
     def order(self) -> Order | None:
-        """The decided order, or None."""
+        """Order whose probability is high enough for a decision, or None."""
         return ORDERS[self.best] if max(self.probabilities) >= AngleLimits.decided else None
 
     @property
     def is_precise(self) -> bool:
-        """True if the zero is determined well enough for a verdict."""
+        """True if the standard error of the zero is small enough to judge it."""
         return self.offset_error <= AngleLimits.zero_off
 
     def is_off(self, limit: float) -> bool:
-        """Return True if the zero deviates significantly, by more than ``limit`` degrees."""
+        """Return True if the zero deviates from the stated zero significantly, and by more than ``limit`` degrees."""
         return abs(self.offset) > tolerance(limit, self.offset_error)
 
     @property
     def sense_probability(self) -> float:
-        """Probability that the angles count counter-clockwise."""
+        """Probability that the angles increase counter-clockwise."""
         return sum(p for p, order in zip(self.probabilities, ORDERS, strict=True) if order.sense > 0)
 
 
 def posterior(evidence: OrderEvidence) -> OrderPosterior:
-    """Return the posterior probabilities of the eight orders from one source of evidence.
+    """Compute the posterior probabilities of the eight orders from one source of evidence.
 
-    Each order is evaluated at the best zero within 22 degrees of its own.
+    The likelihood of an order is that of the best zero within 22 degrees of the order's zero.
     """
     clusters = evidence.clusters.double()
     rows = [SENSES.index(order.sense) for order in ORDERS]
@@ -410,9 +430,10 @@ def posterior(evidence: OrderEvidence) -> OrderPosterior:
 
 
 def combine(parts: Sequence[OrderPosterior]) -> OrderPosterior:
-    """Combine independent sources: probabilities are multiplied, offsets averaged with weights 1 / error^2.
+    """Combine the probabilities of independent sources of evidence by multiplication.
 
-    Only sources whose best order is the combined best one contribute to the offset.
+    The offset is the mean of the offsets with weights 1 / error^2. A source contributes to it only if its most probable
+    order is the most probable order of all sources together.
     """
     log_odds = np.sum([part.log_odds for part in parts], axis=0)
     product = np.prod([part.probabilities for part in parts], axis=0)
@@ -429,7 +450,10 @@ def combine(parts: Sequence[OrderPosterior]) -> OrderPosterior:
 
 
 def tempered(ratios: Tensor) -> float:
-    """Return the tempered sum of the clusters' log-likelihood ratios [C]; 0 if it is negative."""
+    """Return the sum of the log-likelihood ratios of C clusters, [C], reduced according to their disagreement.
+
+    The description of this module explains the reduction. A negative sum gives 0.
+    """
     total = float(ratios.sum())
     count = ratios.numel()
     if total <= 0 or count < 2:
@@ -439,13 +463,17 @@ def tempered(ratios: Tensor) -> float:
 
 
 def _peak(profile: Tensor, zero: int) -> int:
-    """Return the position of the maximum of a profile [180] within 22 degrees of ``zero``."""
+    """Return the angle in degrees of the maximum of a profile [180] within 22 degrees of ``zero``."""
     window = (torch.arange(-AngleLimits.window, AngleLimits.window + 1) + zero) % DEGREES
     return int(window[int(profile[window].argmax())])
 
 
 def _offset(clusters: Tensor, zero: int) -> tuple[float, float]:
-    """Return the best zero minus ``zero`` in degrees, and its standard error from neighboring groups of clusters."""
+    """Estimate the deviation of the best zero from ``zero``.
+
+    Returns:
+        The deviation in degrees; and its standard error, by a jackknife over groups of neighboring clusters.
+    """
     total = clusters.sum(dim=0)
     estimate = _refined(total, zero)
     groups = min(AngleLimits.groups, len(clusters))
@@ -456,7 +484,10 @@ def _offset(clusters: Tensor, zero: int) -> tuple[float, float]:
 
 
 def _refined(profile: Tensor, zero: int) -> float:
-    """Return the maximum of a profile relative to ``zero``, refined by a parabola through three degrees."""
+    """Return the angle of a profile's maximum relative to ``zero`` in degrees.
+
+    A parabola through three values of the profile gives fractions of a degree.
+    """
     degree = _peak(profile, zero)
     before, center, after = profile[[degree - 1, degree, (degree + 1) % DEGREES]].tolist()
     bend = before - 2 * center + after
@@ -465,7 +496,10 @@ def _refined(profile: Tensor, zero: int) -> float:
 
 
 def spatial_cells(points: Tensor) -> Tensor:
-    """Return the cell index of each point [N, 3] in a regular grid, [N] int64, from 0 up without gaps."""
+    """Divide space into the cells of a regular grid, and return the cell index of each point [N, 3], [N] int64.
+
+    The indices are 0, 1, ... without gaps, because empty cells have no index.
+    """
     step = max(1, len(points) // 100_000)
     low, high = (torch.quantile(points[::step].double(), q, dim=0) for q in (0.05, 0.95))
     side = float((high - low).max()) / AngleLimits.cells
@@ -478,6 +512,6 @@ def spatial_cells(points: Tensor) -> Tensor:
 
 
 def sum_by_cluster(values: Tensor, numbers: Tensor) -> Tensor:
-    """Return the sums [C, ...] of values [N, ...] over the clusters with indices ``numbers`` [N]."""
+    """Return the sum of values [N, ...] in each of C clusters, [C, ...]. ``numbers`` [N] has their cluster indices."""
     count = int(numbers.max()) + 1 if len(numbers) else 1
     return values.new_zeros(count, *values.shape[1:]).index_add_(0, numbers, values)

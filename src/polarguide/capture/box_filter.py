@@ -1,4 +1,4 @@
-"""Downscaling with a box filter of K x K pixels; incomplete boxes at the right and bottom are dropped."""
+"""Downscale arrays by averaging boxes of K x K pixels. Incomplete boxes at the right and bottom are left out."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 
 def mean_codes(codes: NDArray[np.uint16], factor: int) -> NDArray[np.uint16]:
-    """Average linear codes over boxes with rounding, [H, W, C] uint16 -> [H // K, W // K, C] uint16."""
+    """Average linear codes [H, W, C] uint16 over boxes, and round them to uint16, [H // K, W // K, C]."""
     if factor == 1:
         return codes
     parts = _strided(codes, factor)
@@ -29,37 +29,37 @@ def mean(values: NDArray[np.float32], factor: int) -> NDArray[np.float32]:
 
 
 def maximum(values: NDArray[Any], factor: int) -> NDArray[Any]:
-    """Return the maximum over each box of an array [H, W]; for masks, True if any pixel is."""
+    """Return the maximum over each box of an array [H, W]. For a mask, it is True if any pixel of the box is True."""
     return functools.reduce(np.maximum, _strided(values, factor)).copy()
 
 
 def every(values: NDArray[np.bool_], factor: int) -> NDArray[np.bool_]:
-    """Return a mask of boxes whose pixels are all True, from [H, W].
+    """Return True for each box of a mask [H, W] in which all pixels are True.
 
-    Foreground masks are downscaled this way. A box with some background must not count as subject in training and
-    scores. Invalid and saturated pixels use ``maximum``.
+    This is used for foreground masks, because a box with some background must not be part of the subject. Masks of
+    invalid and saturated pixels are downscaled by ``maximum`` instead.
     """
     return np.asarray(_boxed(values, factor).all(axis=(1, 3)))
 
 
 def agreed(numbers: NDArray[np.int32], factor: int) -> NDArray[np.int32]:
-    """Return the number that all pixels of a box share, from [H, W]; 0 if they differ."""
+    """Return the number of each box of an array [H, W] if all of its pixels are equal, and 0 if they differ."""
     first, *others = _strided(numbers, factor)
     same = functools.reduce(np.logical_and, (first == other for other in others), np.full(first.shape, True))
     return np.where(same, first, 0).astype(np.int32)
 
 
 def unit_mean(normals: NDArray[np.float32], factor: int) -> NDArray[np.float32]:
-    """Average vectors [H, W, 3] over boxes and normalize them; zero if they cancel."""
+    """Average vectors [H, W, 3] over boxes, and normalize them. A mean of zero remains zero."""
     average = mean(normals, factor)
     length = np.linalg.norm(average, axis=-1, keepdims=True)
     return np.where(length > 1e-6, average / np.maximum(length, 1e-6), 0.0).astype(np.float32)
 
 
 def _strided(values: NDArray[Any], factor: int) -> list[NDArray[Any]]:
-    """Return the K x K pixels of every box as arrays [H // K, W // K, ...].
+    """Return a list of K x K arrays [H // K, W // K, ...]. Each has the pixels at one position in all boxes.
 
-    NumPy reduces over short axes an order of magnitude slower.
+    Combining these arrays is an order of magnitude faster than a reduction over short axes in NumPy.
     """
     height = values.shape[0] // factor * factor
     width = values.shape[1] // factor * factor
@@ -67,7 +67,7 @@ def _strided(values: NDArray[Any], factor: int) -> list[NDArray[Any]]:
 
 
 def _boxed(values: NDArray[Any], factor: int) -> NDArray[Any]:
-    """Split [H, W, ...] into boxes [H // K, K, W // K, K, ...]."""
+    """Reshape an array [H, W, ...] to boxes, [H // K, K, W // K, K, ...]."""
     rows = values.shape[0] // factor
     columns = values.shape[1] // factor
     return values[: rows * factor, : columns * factor].reshape(

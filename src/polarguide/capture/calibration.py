@@ -1,4 +1,4 @@
-"""Deviations of a polarization camera or filter from an ideal one: gains, and order, sense and zero of its angles."""
+"""Calibration of a polarization camera or filter: gains of the four pictures, and their true polarizer angles."""
 
 from __future__ import annotations
 
@@ -20,11 +20,14 @@ Gains = tuple[Gain, Gain, Gain, Gain]
 Sense = Literal["ccw", "cw"]
 UNIT_GAINS: Gains = (1.0, 1.0, 1.0, 1.0)
 LARGEST_IMBALANCE = 0.1
-"""Largest relative difference of pair sums by gains; more means swapped or nonlinear files."""
+"""Largest relative difference of the pair sums I0 + I90 and I45 + I135 that gains can explain.
+
+A larger difference means swapped or nonlinear files.
+"""
 LARGEST_ZERO = 3600.0
-"""Largest zero of the angles in degrees."""
+"""Largest direction of angle zero in degrees that is accepted."""
 ROTATED_PEAK = (1.0 + math.sqrt(2.0)) / 2.0
-"""Largest intensity behind a rotated analyzer if four angles have at most 1."""
+"""Largest intensity behind a polarizer at any angle if the intensities at the four angles are at most 1."""
 UNIDENTIFIED = (
     "Gains within a pair (0 and 90, or 45 and 135 degrees) look like polarization and remain: polarguide calibrate "
     "measures them."
@@ -34,15 +37,15 @@ _FEWEST = 32
 
 @dataclass(frozen=True)
 class Calibration:
-    """Relation of the pictures named 0, 45, 90 and 135 to displayed polarizer angles.
+    """Gains and true polarizer angles of the pictures named 0, 45, 90 and 135.
 
     Attributes:
-        gains: response of the pictures in the order of their names, by which intensities are divided. None to estimate
-            the ratio of the pair sums.
-        order: true angle of each of the pictures named 0, 45, 90 and 135.
-        sense: direction of the angles as displayed, "ccw" or "cw"; None for the default of the source, which is "ccw"
-            except for some published datasets.
-        zero: direction of angle zero, in degrees counter-clockwise from the image's horizontal.
+        gains: factors by which the intensities of the pictures are divided, in the order of the names. If None, gains
+            are estimated from the pictures.
+        order: angle of the instrument at which each of the pictures named 0, 45, 90 and 135 was taken.
+        sense: direction in which the angles increase as displayed, "ccw" or "cw". None means the default of the source:
+            "ccw", except for some published datasets.
+        zero: direction of angle zero, in degrees counter-clockwise from the picture's horizontal.
     """
 
     gains: Gains | None = None
@@ -52,26 +55,31 @@ class Calibration:
 
     @property
     def permutes(self) -> bool:
-        """True if the calibration only permutes pictures."""
+        """True if the four pictures only need to be exchanged, because the zero is a multiple of 45 degrees."""
         return (self.zero / 45.0).is_integer()
 
     @property
     def peak(self) -> float:
-        """Largest calibrated intensity for intensities up to 1."""
+        """Largest intensity that ``oriented`` can return if all of its input is at most 1."""
         return 1.0 if self.permutes else ROTATED_PEAK
 
     def record(self) -> dict[str, Any]:
-        """Return order, sense and zero for ``scene.json``."""
+        """Return order, sense and zero as an entry of ``scene.json``."""
         return {"order": list(self.order), "sense": self.sense or "ccw", "zero_degrees": self.zero}
 
     def true_angles(self) -> tuple[tuple[int, ...], float]:
-        """Return the true angles of the pictures named 0, 45, 90 and 135 as multiples of 45, and their common rest."""
+        """Return the true angles of the pictures named 0, 45, 90 and 135 in two parts.
+
+        Returns:
+            The angle of each picture, rounded to a multiple of 45 degrees; and the remaining rotation in degrees,
+            which is equal for all four.
+        """
         sign = -1 if self.sense == "cw" else 1
         steps = 45 * round(self.zero / 45.0)
         return tuple((sign * angle + steps) % 180 for angle in self.order), self.zero - steps
 
     def options(self) -> str:
-        """Return order, sense and zero as options of ``prepare``."""
+        """Return order, sense and zero as text with the options of ``prepare``."""
         order = ",".join(map(str, self.order))
         return f"--order {order} --sense {self.sense or 'ccw'} --zero {self.zero:g}"
 
@@ -80,7 +88,8 @@ def checked(calibration: Calibration, where: object) -> Calibration:
     """Validate a calibration and return it.
 
     Raises:
-        PolarguideError: gains are not positive, the order is not a permutation, the zero is not finite, ...
+        PolarguideError: a value is invalid: gains are not positive, the order is not a permutation, the zero is not
+            finite, ...
     """
     check_options(calibration, lambda field: f"{where} ({field})")
     require(
@@ -94,11 +103,11 @@ def checked(calibration: Calibration, where: object) -> Calibration:
 
 
 def combined(first: Calibration, second: Calibration) -> Calibration | None:
-    """Combine two calibrations into one; ``second`` was measured on pictures corrected by ``first``.
+    """Combine two calibrations into one that has the effect of ``first`` followed by ``second``.
 
     Returns:
-        Order, sense and zero, without gains. None if no calibration is equivalent: ``first`` rotated the pictures by a
-        fraction of 45 degrees, and ``second`` pairs them differently.
+        The calibration, without gains. It is None if no single calibration has this effect. This happens if ``first``
+        rotates by a fraction of 45 degrees and ``second`` changes which pictures are perpendicular.
     """
     named, turn = first.true_angles()
     renamed, more = second.true_angles()
@@ -117,7 +126,7 @@ def combined(first: Calibration, second: Calibration) -> Calibration | None:
 
 
 def _count(sign: int, zero: int) -> tuple[int, ...]:
-    """Return the true angles of the pictures named 0, 45, 90 and 135 for a direction and a zero."""
+    """Return the true angles of the pictures named 0, 45, 90 and 135 for a sense (1 or -1) and a zero."""
     return tuple((sign * angle + zero) % 180 for angle in ANGLES)
 
 
@@ -129,7 +138,7 @@ class _Gains(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class _File(msgspec.Struct, forbid_unknown_fields=True):
-    """Content of a calibration file."""
+    """Fields of a calibration file."""
 
     gains: _Gains | None = None
     order: tuple[int, int, int, int] = ANGLES
@@ -138,9 +147,10 @@ class _File(msgspec.Struct, forbid_unknown_fields=True):
 
 
 def read_calibration(path: Path) -> Calibration:
-    """Read a calibration file: ``{"gains": {"0": 1.01, ...}, "order": [...], "sense": "ccw", "zero": 0.0}``.
+    """Read a calibration from a JSON file.
 
-    All keys are optional.
+    Its content has the form ``{"gains": {"0": 1.01, ...}, "order": [...], "sense": "ccw", "zero": 0.0}``. All keys are
+    optional.
 
     Raises:
         PolarguideError: the file cannot be read, or has unknown keys or invalid values.
@@ -158,14 +168,16 @@ def read_calibration(path: Path) -> Calibration:
 
 
 def pair_ratio(angles: NDArray[np.floating[Any]], usable: NDArray[np.bool_]) -> float | None:
-    """Return the median of (I0 + I90) / (I45 + I135), which is 1 for ideal analyzers in any light.
+    """Return the median of the ratio (I0 + I90) / (I45 + I135) of the two pair sums.
+
+    For ideal polarizers the ratio is 1 in any light.
 
     Args:
-        angles: linear intensities [4, ...], without channels.
+        angles: linear intensities at 0, 45, 90 and 135 degrees without channels, [4, ...].
         usable: mask of usable samples, [...].
 
     Returns:
-        The ratio; None if fewer than 32 samples are bright enough.
+        The ratio, or None if fewer than 32 samples are bright enough.
     """
     i0, i45, i90, i135 = angles[:, usable].astype(np.float64)
     first = i0 + i90
@@ -177,7 +189,10 @@ def pair_ratio(angles: NDArray[np.floating[Any]], usable: NDArray[np.bool_]) -> 
 
 
 def balancing_gains(ratio: float | None) -> Gains | None:
-    """Return gains of the four pictures that explain a ratio of pair sums, with product 1; None if it is too large."""
+    """Return gains of the four pictures that make the two pair sums equal. The product of the gains is 1.
+
+    Return None if the ratio deviates too much from 1, see ``LARGEST_IMBALANCE``.
+    """
     if ratio is None or abs(ratio - 1.0) > LARGEST_IMBALANCE:
         return None
     root = math.sqrt(ratio)
@@ -185,14 +200,15 @@ def balancing_gains(ratio: float | None) -> Gains | None:
 
 
 def oriented(intensities: NDArray[np.float32], calibration: Calibration) -> NDArray[np.float32]:
-    """Return intensities at 0, 45, 90 and 135 degrees, counter-clockwise as displayed.
+    """Convert the intensities of the four pictures to displayed angles of 0, 45, 90 and 135 degrees, counter-clockwise.
 
-    The angle L of the instrument is ``sense * L + zero`` as displayed. Multiples of 45 degrees permute pictures. Any
-    other zero rotates (S1, S2) by twice the angle, from which the four intensities are computed again.
+    The angle L of the instrument is displayed at ``sense * L + zero``. If the zero is a multiple of 45 degrees, the
+    pictures are only exchanged. Otherwise the Stokes components S1 and S2 are rotated by twice the remaining angle, and
+    the four intensities are computed from the rotated Stokes vectors.
 
     Args:
-        intensities: intensities by the names of the pictures, [4, ...].
-        calibration: order, sense and zero; gains are ignored.
+        intensities: intensities of the pictures named 0, 45, 90 and 135, [4, ...].
+        calibration: order, sense and zero. Its gains are not applied.
 
     Returns:
         [4, ...], at least 0 and at most ``calibration.peak`` times the largest input.

@@ -1,4 +1,4 @@
-"""Checks of a capture by its pictures: full scale, exposure, encoding, order of the files, and gains.
+"""Find faults of a capture in its pictures: exposure, encoding, order of the files, and different gains.
 
 ``measure`` reduces each view to a few numbers while its pictures are in memory. ``exposure_warnings`` and
 ``polarization_warnings`` turn the numbers of all views into warnings.
@@ -31,22 +31,22 @@ class CheckLimits:
     """Constants of the checks.
 
     Attributes:
-        top_share: share of the code range, from its top, in the histogram for ``full_scale``.
-        full_share: share of the code range, from its top, in which values can be full scale.
-        dark: 99th percentile of the intensities below which a view is almost black.
-        blown: share of saturated pixels above which a view is heavily saturated.
-        low_code: code below which quantization hides the polarization.
+        top_share: share of the value range that the histogram for ``full_scale`` covers. It starts at the top.
+        full_share: share of the value range in which the full scale may be. It starts at the top.
+        dark: a view is almost black if the 99th percentile of its intensities is smaller.
+        blown: a view is heavily saturated if the share of its saturated pixels is larger.
+        low_code: quantization hides the polarization of pixels with a smaller code.
         samples: largest number of pixels of a view that are measured.
-        residual: largest residual of the pair sums without a warning, as a share of S0.
-        right_angle: largest deviation of a right angle in degrees. A pair sum is then off by two percent of the
-            polarized light.
-        other_exposure: smallest difference of logarithms of different exposures: half of a third of a stop, the step of
-            cameras.
-        tiles: tiles of a picture in each direction, for jackknife errors.
-        hidden: share of the largest value below which read-out noise hides the polarization.
-        fewest: number of pixels that a regression needs.
-        least_spread: standard deviation of the regressor that a regression needs.
-        moment_samples: largest number of pixels of a view for second moments.
+        residual: residual of the pair sums, as a share of S0, above which the user gets a warning.
+        right_angle: largest deviation of two perpendicular pictures from 90 degrees, in degrees. The sum of the two
+            pictures is then wrong by two percent of the polarized light.
+        other_exposure: smallest difference of the logarithms of two exposures that count as different. It is half of
+            a third of a stop, because cameras change exposures by thirds of a stop.
+        tiles: number of tiles of a picture in each direction, for jackknife errors.
+        hidden: read-out noise hides the polarization of pixels below this share of the largest value.
+        fewest: smallest number of pixels for a regression.
+        least_spread: smallest standard deviation of the regressor for a regression.
+        moment_samples: largest number of pixels of a view from which second moments are computed.
     """
 
     top_share = 0.02
@@ -68,23 +68,24 @@ class CheckLimits:
 # Curvature (see ``pair_slopes``) of encoded data taken as linear is about -0.6, of linear data decoded as sRGB about
 # +0.3; the gain differences of real sensors leave less than 0.1.
 ENCODED = (-0.12, -0.25)
-"""Curvatures below which files may be encoded, and below which they are."""
+"""Two limits for files that are not linear: they may be encoded below the first curvature, and are below the second."""
 DECODED = (0.1, 0.2)
-"""Curvatures above which files may be decoded twice, and above which they are."""
+"""Two limits for files that were decoded twice: they may be above the first curvature, and are above the second."""
 BENT = 0.05
-"""Largest curvature of a linear response, if it is significant. A gamma of 0.9 has -0.056, with a similar error of
+"""Largest significant curvature of a linear response. A gamma of 0.9 has a curvature of -0.056, and a similar error of
 DoLP."""
 
 
 @dataclass(frozen=True)
 class Measures:
-    """Measurements of one view.
+    """Statistics of the pictures of one view, from which warnings are derived.
 
     Attributes:
         bright: 99th percentile of the linear intensities, in [0, 1].
-        residuals: median of |difference of the two pair sums| / S0 for the three pairings: (0, 90 | 45, 135), (0, 45 |
-            90, 135), (0, 135 | 45, 90). The first is zero for an ideal capture.
-        slopes: ``pair_slopes`` of the two pairs; empty with too few pixels.
+        residuals: difference of the two pair sums relative to S0, as the median of its absolute value. There is a value
+            for each of the three ways to form two pairs: (0, 90 | 45, 135), (0, 45 | 90, 135), (0, 135 | 45, 90). The
+            first value is zero for an ideal capture.
+        slopes: result of ``pair_slopes`` for the pairs of the view; empty if the view has too few usable pixels.
     """
 
     bright: float
@@ -93,23 +94,26 @@ class Measures:
 
 
 def sampled(codes: NDArray[Any]) -> NDArray[Any]:
-    """Return the sample of a view's codes [K, H, W, ...] for ``measure``, so that the caller can discard the codes."""
+    """Return a sample of a view's codes [K, H, W, ...].
+
+    It is sufficient for ``measure``, so the caller can free the memory of the codes.
+    """
     step = _step(codes.shape[1] * codes.shape[2])
     return codes[:, ::step, ::step].copy()
 
 
 def _step(pixels: int) -> int:
-    """Return the distance between sampled pixels."""
+    """Return the distance between sampled pixels in each direction."""
     return max(1, math.ceil(math.sqrt(pixels / CheckLimits.samples)))
 
 
 def measure(codes: NDArray[np.uint16], usable: NDArray[np.bool_], *, four: bool = True) -> Measures:
-    """Measure one view.
+    """Compute the statistics of one view.
 
     Args:
-        codes: linear codes [K, H, W, 3], or ``sampled`` ones.
-        usable: mask of pixels without saturated and invalid ones, [H, W].
-        four: True for pictures at 0, 45, 90 and 135 degrees. Otherwise, only the brightness is measured.
+        codes: linear codes [K, H, W, 3], or a sample of them by ``sampled``.
+        usable: mask of the pixels that are neither saturated nor invalid, [H, W].
+        four: True if the pictures are at 0, 45, 90 and 135 degrees. Otherwise, only the brightness is measured.
     """
     step = _step(usable.size)
     sample = (codes if codes.shape[1:3] != usable.shape else codes[:, ::step, ::step]).astype(np.float64)
@@ -127,18 +131,18 @@ def measure(codes: NDArray[np.uint16], usable: NDArray[np.bool_], *, four: bool 
 
 
 def top_histogram(raw: NDArray[Any]) -> NDArray[np.int64]:
-    """Return counts of the stored values in the top 2 % of their range, up to the largest possible value."""
+    """Count how often each stored value in the top 2 % of the range occurs. The last count is the largest value's."""
     full = int(np.iinfo(raw.dtype).max)
     low = full - int(full * CheckLimits.top_share)
     return np.bincount(raw[raw >= low].astype(np.int64) - low, minlength=full - low + 1)
 
 
 def full_scale(histogram: NDArray[np.int64], full: int) -> int | None:
-    """Return the stored value at which a capture saturates; None if no value does.
+    """Return the stored value at which the pixels of a capture are saturated. Return None if no pixel is saturated.
 
-    It is the largest possible value if it occurs. A capture with coarser values (10 bits in 16) ends slightly below.
-    Then the largest occurring value counts if it lies in the top 0.2 % of the range and is much more frequent than the
-    values near it.
+    It is the largest possible value of the files if this value occurs. The largest value of a sensor with fewer bits,
+    such as 10 bits stored in 16, is slightly smaller. The largest value that occurs is therefore also accepted if it is
+    in the top 0.2 % of the range and much more frequent than the values near it.
 
     Args:
         histogram: sum of ``top_histogram`` over the capture.
@@ -163,10 +167,10 @@ def exposure_warnings(
 
     Args:
         names: view names.
-        measures: measurements of each view.
-        blown: share of pixels of each view with a picture at full scale.
-        largest: largest value stored in any picture.
-        full: largest possible value.
+        measures: statistics of each view.
+        blown: share of the saturated pixels of each view.
+        largest: largest stored value in all pictures.
+        full: largest value that the files can store.
     """
     warnings = []
     if full == FULL_CODE and 0 < largest < 4096:
@@ -229,10 +233,10 @@ FOUR_PAIRS = ((0, 2), (1, 3))
 
 
 def right_pairs(angles: Sequence[object]) -> list[tuple[int, int]]:
-    """Return pairs of indices of perpendicular pictures, with each picture in at most one pair.
+    """Return pairs of indices of perpendicular pictures. Each picture is in at most one pair.
 
     Args:
-        angles: angles in degrees, or words for pictures without an angle.
+        angles: angle of each picture in degrees, or a word if it has no known angle.
     """
     free = [(place, angle) for place, angle in enumerate(angles) if isinstance(angle, int | float)]
     pairs = []
@@ -248,7 +252,7 @@ def right_pairs(angles: Sequence[object]) -> list[tuple[int, int]]:
 
 @dataclass(frozen=True)
 class Curvature:
-    """Curvature of the response, with its standard error (jackknife over tiles)."""
+    """Curvature of the camera's response, which is 0 for linear files, and its standard error."""
 
     value: float
     error: float
@@ -265,18 +269,21 @@ class Curvature:
 def pair_slopes(
     codes: NDArray[Any], usable: NDArray[np.bool_], pairs: Sequence[tuple[int, int]]
 ) -> list[NDArray[np.float64]]:
-    """Return sums of a regression over all pairs of a view's pairs for each tile: number of pixels, q q, q r.
+    """Compute sums for a regression that measures the curvature of the response from the pair sums of a view.
 
-    The regressand r is the difference of two pair sums over S0, (I0 + I90 - I45 - I135) / S0. The regressor q is the
-    difference of the squared polarizations, ((I0 - I90) / S0)^2 - ((I45 - I135) / S0)^2. Linear data have slope 0. A
-    concave encoding has a negative slope, a convex one a positive slope. Pictures of different exposures add shares of
-    I0 - I90 and I45 - I135 to the difference of the sums, to first order. A fit of both is subtracted, so exposures may
-    differ.
+    The dependent variable r is the difference of two pair sums, (I0 + I90 - I45 - I135) / S0. The regressor q is the
+    difference of the squared polarizations, ((I0 - I90) / S0)^2 - ((I45 - I135) / S0)^2. The slope of r over q is 0 for
+    linear data, negative for a concave encoding, and positive for a convex encoding. If the exposures of the pictures
+    differ, r also contains shares of I0 - I90 and I45 - I135. A fit of these two differences is subtracted.
 
     Args:
         codes: linear codes [K, H, W, C] of a view, or of a sample of it.
-        usable: [H, W].
+        usable: mask of usable pixels, [H, W].
         pairs: indices of perpendicular pictures, see ``right_pairs``.
+
+    Returns:
+        An array for each combination of two pairs, with the number of pixels, the sum of q q, and the sum of q r in
+        each tile of the picture.
     """
     if len(pairs) < 2:
         return []
@@ -299,7 +306,10 @@ def pair_slopes(
 
 
 def curvature_of(tiles: Sequence[NDArray[np.float64]]) -> Curvature | None:
-    """Return the curvature of the response from the ``pair_slopes`` of all views; None with too little polarization."""
+    """Compute the curvature of the response from the ``pair_slopes`` of all views.
+
+    Return None if the polarization is too weak.
+    """
     total = np.sum(tiles, axis=0)
     if len(tiles) < 2 or total[0] < CheckLimits.fewest or total[1] < total[0] * CheckLimits.least_spread**2:
         return None
@@ -309,9 +319,9 @@ def curvature_of(tiles: Sequence[NDArray[np.float64]]) -> Curvature | None:
 
 
 def encoding(curvature: Curvature | None) -> Literal["linear", "srgb"] | None:
-    """Return the encoding of files with this curvature when read as linear; None if undecided.
+    """Decide the encoding of files from the curvature that they have if they are read as linear.
 
-    ``prepare``, ``inspect`` and the warnings of ``train`` share this decision.
+    Return None if the curvature does not decide.
     """
     doubtful, certain = ENCODED
     if curvature is not None and curvature.value < certain and curvature.surely_below(doubtful):
@@ -322,20 +332,20 @@ def encoding(curvature: Curvature | None) -> Literal["linear", "srgb"] | None:
 
 
 def _is_off(residuals: tuple[float, float, float]) -> bool:
-    """Return True if the residual of the stated pairing is large, or much larger than another."""
+    """Return True if the residual of the first pairing is large, or much larger than the residual of another."""
     right, *others = residuals
     return right > CheckLimits.residual or (right > 0.4 * CheckLimits.residual and min(others) < 0.25 * right)
 
 
 @dataclass(frozen=True)
 class MeasuredGains:
-    """Gains of the four pictures by their pair sums.
+    """Gains of the four pictures of a view, measured from the pair sums.
 
     Attributes:
-        logs: natural logarithms in the order of the angles, mean 0.
-        errors: standard errors (jackknife over tiles of the pictures).
-        pairing: index of the pairing in the order of ``Measures.residuals``: 0 if 0 and 90 are a pair, 1 if 0 and 45
-            are, 2 if 0 and 135 are; None if the samples contradict all of them.
+        logs: natural logarithms of the gains in the order of the angles, with mean 0.
+        errors: standard errors of ``logs``, by a jackknife over tiles of the pictures.
+        pairing: index of the pictures that are perpendicular: 0 for 0 and 90, 1 for 0 and 45, 2 for 0 and 135, as in
+            ``Measures.residuals``. It is None if the samples contradict all three.
     """
 
     logs: tuple[float, ...]
@@ -343,10 +353,10 @@ class MeasuredGains:
     pairing: int | None
 
     def deviating(self, stated: Sequence[float] = (0.0, 0.0, 0.0, 0.0)) -> dict[int, float]:
-        """Return the pictures that are exposed significantly differently than stated: factor by angle.
+        """Return the pictures whose exposure differs significantly from the stated exposure, as factors by angle.
 
         Args:
-            stated: logarithms of the exposures, as files state them.
+            stated: logarithms of the exposures that the files state.
         """
         if self.pairing != 0:
             return {}
@@ -360,10 +370,14 @@ class MeasuredGains:
 
 
 def pair_moments(gray: NDArray[np.floating[Any]], usable: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Return second moments of the samples of a view by tiles, [T, 5, 4]: four rows of moments, and one of counts.
+    """Compute the second moments of the intensities of a view in each tile of the picture.
 
     Args:
-        gray: linear intensities [4, H, W]. usable: [H, W].
+        gray: linear intensities at 0, 45, 90 and 135 degrees, [4, H, W].
+        usable: mask of usable pixels, [H, W].
+
+    Returns:
+        [T, 5, 4] for T tiles. The first four rows are the moments, the last row is the number of pixels.
     """
     step = max(1, math.ceil(math.sqrt(usable.size / CheckLimits.moment_samples)))
     gray = gray[:, ::step, ::step].astype(np.float64)
@@ -380,10 +394,10 @@ def pair_moments(gray: NDArray[np.floating[Any]], usable: NDArray[np.bool_]) -> 
 
 
 def measured_gains(moments: NDArray[np.float64]) -> MeasuredGains | None:
-    """Return the gains of the pictures of one or several views; None if too few pixels are bright enough.
+    """Compute the gains of the four pictures of views. Return None if too few pixels are bright enough.
 
     Args:
-        moments: ``pair_moments`` of the views, [T, 5, 4].
+        moments: result of ``pair_moments`` for one view or several views, [T, 5, 4].
     """
     moments = moments[moments[:, 4, 0] > 0]
     if len(moments) < 2 or moments[:, 4, 0].sum() < CheckLimits.fewest:

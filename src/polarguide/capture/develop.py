@@ -1,6 +1,7 @@
-"""Linear intensities from camera files: mosaics of a polarization sensor, and shots through a filter.
+"""Compute linear intensities from camera files: mosaics of a polarization sensor, and shots through a filter.
 
-Captures and single shots share these functions. The caller chooses the pictures that are evaluated together.
+The functions work for whole captures and for single shots. Levels and exposures are estimated from all pictures that
+the caller passes together.
 """
 
 from __future__ import annotations
@@ -61,25 +62,25 @@ from polarguide.core.progress import Advance
 from polarguide.geometry.polarizer import ANGLES
 
 QUARTER_FLIPS = ("90", "270")
-"""Values of ``flip`` for mosaics that were rotated, in degrees counter-clockwise."""
+"""Values of the option ``flip`` that specify a rotation by 90 degrees or 270 degrees counter-clockwise."""
 SMALLEST = 16
-"""Smallest number of pixels of the shorter side of a mosaic."""
+"""Smallest length of the shorter side of a mosaic in pixels."""
 WORKED = {"quarter": 16, "half": 60, "full": 240}
-"""Smallest memory in bytes per sensor pixel during the development of a mosaic, by demosaicing mode."""
+"""Number of bytes per sensor pixel that the development of a mosaic takes at least, by demosaicing mode."""
 
 
 class MosaicFiles:
-    """Reader of the mosaics of one sensor.
+    """Reader of the raw mosaics of one sensor, which also converts their values to linear intensities.
 
     Attributes:
-        pattern: pattern of the sensor, starting at the top-left pixel after ``cut``.
-        crop: columns and rows that ``cut`` removes.
-        corner: column and row of that pixel on the sensor.
+        pattern: pattern of the sensor, starting at the top-left pixel of a mosaic after ``cut``.
+        crop: number of columns and rows that ``cut`` removes at the left and top.
+        corner: column and row of the sensor at which a mosaic starts after ``cut``.
         analyzers: calibration of the sensor, or None.
     """
 
     def __init__(self, options: RawMosaicOptions) -> None:
-        """Take sensor, region, packing, dark frame and calibration from the options.
+        """Create a reader with the sensor, region, packing, dark frame and calibration of the options.
 
         Raises:
             PolarguideError: the sensor is missing, or the calibration is damaged or belongs to another sensor.
@@ -101,15 +102,15 @@ class MosaicFiles:
         self.analyzers = calibration_of(options)
 
     def read(self, where: Path | str, values: NDArray[Any] | None = None) -> NDArray[Any]:
-        """Return the stored values [H, W] of a whole mosaic in the orientation of the sensor.
+        """Read the stored values [H, W] of a whole mosaic, and return them in the orientation of the sensor.
 
         Args:
             where: path of the file, or a name for messages if the mosaic is in memory.
-            values: mosaic in memory, uint8 or uint16.
+            values: mosaic in memory, uint8 or uint16. By default, the file ``where`` is read.
 
         Raises:
-            PolarguideError: the file is unreadable, too small or a grid of four pictures, the mosaic exceeds the
-                memory, or it reaches beyond the calibrated region.
+            PolarguideError: the file is unreadable, too small, or a grid of four pictures. Or the mosaic does not fit
+                into memory, or is larger than the calibrated region.
         """
         if values is None:
             self._require_memory(Path(where))
@@ -135,10 +136,10 @@ class MosaicFiles:
             )
 
     def _turned_back(self, where: Path | str, values: NDArray[Any]) -> NDArray[Any]:
-        """Undo the mirroring or rotation that ``flip`` specifies.
+        """Undo the mirroring or rotation of a mosaic that the option ``flip`` specifies.
 
         Raises:
-            PolarguideError: the mosaic is larger than the sensor, possibly because it was rotated.
+            PolarguideError: the mosaic is wider or higher than the sensor, possibly because it was rotated.
         """
         flip = self._options.flip
         if flip in QUARTER_FLIPS:
@@ -162,20 +163,20 @@ class MosaicFiles:
         return values[::-1] if flip in ("y", "xy") else values
 
     def depth(self, path: Path, values: NDArray[Any]) -> tuple[int, int | None]:
-        """Return the bits per pixel of a file and the full scale that it states.
+        """Return the number of bits per pixel in a file, and the full scale that the file states.
 
-        It returns None as full scale if the file states none or the user specifies ``bits``.
+        The full scale is None if the file does not state it, or if the user specifies ``bits``.
         """
         stated = self._raw.full_scale(path, values) if self._options.bits is None else None
         return self._raw.container(path, values.dtype), stated
 
     def cut(self, values: NDArray[Any]) -> NDArray[Any]:
-        """Crop a mosaic to whole cells of the pattern."""
+        """Crop a mosaic [H, W] so that it consists of whole polarizer cells."""
         values = values[self.crop[1] :, self.crop[0] :]
         return np.ascontiguousarray(values[: values.shape[0] // 2 * 2, : values.shape[1] // 2 * 2])
 
     def dark(self, shape: tuple[int, ...]) -> NDArray[np.float32] | None:
-        """Return the dark frame, cropped like the mosaics; None without one."""
+        """Return the dark frame, cropped by ``cut``. Return None if the user specifies no dark frame."""
         if self._options.dark_frame is None:
             return None
         dark = self._turned_back(self._options.dark_frame, read_mosaic(self._options.dark_frame, self._raw))
@@ -195,16 +196,20 @@ class MosaicFiles:
         dark: NDArray[np.float32] | None,
         shape: tuple[int, ...],
     ) -> tuple[float | None, NDArray[np.float64]]:
-        """Return the ratio of the pair sums and the colors [3, N] of the usable blocks.
+        """Measure the ratio of the pair sums and the colors of the light in blocks of mosaics.
 
-        Samples of different angles lie at different pixels. Tent weights interpolate all of them to the center of a
-        block of two periods, so gradients of the picture cancel in the ratio. Dark blocks have the ratio None.
+        Samples of different angles are at different pixels. Tent weights interpolate all of them to the center of
+        a block of two periods, so gradients of the picture cancel in the ratio.
 
         Args:
-            samples: ``sample_blocks`` of two periods from each mosaic.
+            samples: blocks with a side of two periods from each mosaic, see ``sample_blocks``.
             levels: levels of the stored values.
             dark: dark frame, or None.
-            shape: rows and columns of a mosaic after ``cut``.
+            shape: numbers of rows and columns of a mosaic after ``cut``.
+
+        Returns:
+            The ratio (I0 + I90) / (I45 + I135), or None if the blocks are too dark; and the colors of the usable
+            blocks, [3, N].
         """
         values = np.concatenate(samples)
         period = self.pattern.period
@@ -240,12 +245,20 @@ class MosaicFiles:
         *masks: NDArray[np.bool_],
         corner: tuple[int, int] | None = None,
     ) -> tuple[NDArray[np.float32], tuple[NDArray[np.bool_], ...]]:
-        """Linearize a mosaic or a part of it, apply the calibration, and dilate masks of unusable samples.
+        """Convert the stored values of a mosaic or a part of it to linear intensities, and apply the calibration.
+
+        The calibration mixes the samples of a polarizer cell. If there is a calibration, masks of unusable samples are
+        therefore extended to whole cells.
 
         Args:
-            values: stored values [H, W] after ``cut``. levels: levels of the values. dark: dark frame [H, W], or None.
-            masks: masks [H, W]; the calibration mixes the samples of a cell, so a mask covers whole cells.
-            corner: column and row of the first pixel of a part on the sensor.
+            values: stored values after ``cut``, [H, W].
+            levels: levels of the stored values.
+            dark: dark frame [H, W], or None.
+            masks: masks of unusable samples, [H, W] each.
+            corner: column and row of the sensor at which the part starts; default: ``corner`` of the reader.
+
+        Returns:
+            The linear intensities [H, W], and the masks.
         """
         linear = levels.linear(values, dark)
         if self.analyzers is None:
@@ -259,7 +272,10 @@ class MosaicFiles:
         white: Sequence[float] = (1, 1, 1),
         scale: float = 1.0,
     ) -> NDArray[np.float32]:
-        """Return the factor of every sample, [H, W]: ``scale * white / gain`` for its color and angle."""
+        """Return the factor by which each sample of a mosaic is multiplied, [H, W].
+
+        It is ``scale * white / gain``, with the white balance of the sample's color and the gain of its angle.
+        """
         of_angle = dict(zip(ANGLES, gains, strict=True))
         factors = np.vectorize(lambda angle: scale / of_angle[angle])(self.pattern.angles)
         if self.pattern.colors is not None:
@@ -268,7 +284,9 @@ class MosaicFiles:
 
 
 def calibration_of(options: RawMosaicOptions) -> AnalyzerCalibration | None:
-    """Return the calibration of the sensor, cached for all mosaics; None without one.
+    """Read the calibration of the sensor. Return None if the options specify no calibration.
+
+    The calibration is cached because many mosaics use it.
 
     Raises:
         PolarguideError: the file is missing, damaged or belongs to another sensor.
@@ -292,7 +310,7 @@ _BLOCKS = 1024
 
 
 def sample_blocks(values: NDArray[Any], size: int) -> NDArray[Any]:
-    """Return a regular subset of the blocks of a mosaic, [N, size, size]."""
+    """Return N square blocks of a mosaic in a regular grid, [N, size, size]."""
     rows = values.shape[0] // size
     columns = values.shape[1] // size
     grid = values[: rows * size, : columns * size].reshape(rows, size, columns, size)
@@ -301,20 +319,23 @@ def sample_blocks(values: NDArray[Any], size: int) -> NDArray[Any]:
 
 
 LARGE_IMBALANCE = 0.01
-"""Relative difference of uncorrected pair sums above which the user gets a note."""
+"""Relative difference of the pair sums above which the user gets a note if it is not corrected."""
 
 
 def pair_gains(
     ratio: float | None, options: GainOptions, notes: Mapping[str, str], *, calibrated: bool = False
 ) -> tuple[Gains, list[str]]:
-    """Return the gains of the four angles and notes for the user.
+    """Choose the gains of the four angles, and describe the choice for the user.
 
     Args:
-        ratio: ratio of the pair sums; None if the pictures are too dark.
-        options: gains of a calibration take precedence over ``gains``.
-        notes: templates with a placeholder for the ratio minus 1, by outcome: "dark", "off" (too large for gains),
-            "corrected" and "left" (not corrected, above ``LARGE_IMBALANCE``).
-        calibrated: True if analyzer vectors, which include gains, have corrected the intensities.
+        ratio: ratio (I0 + I90) / (I45 + I135) of the pair sums; None if the pictures are too dark.
+        options: options of the user. The gains in ``calibration`` take precedence over the option ``gains``.
+        notes: text of the note for each outcome, with a placeholder for the ratio minus 1. The outcomes are "dark",
+            "off" if the ratio is too large for gains, "corrected", and "left" if a large ratio is not corrected.
+        calibrated: True if the intensities were corrected with analyzer vectors, which include the gains.
+
+    Returns:
+        The gains, and notes for the user.
     """
     if calibrated:
         return UNIT_GAINS, imbalance_notes(ratio)
@@ -335,27 +356,33 @@ def pair_gains(
 def as_displayed(
     linear: NDArray[np.float32], calibration: Calibration, orientation: int
 ) -> NDArray[np.float32]:
-    """Return four shots [4, H, W, C] by true angle, in the orientation that EXIF specifies for display."""
+    """Convert four shots to displayed angles of 0, 45, 90 and 135 degrees, and rotate them for display.
+
+    Args:
+        linear: linear intensities of the shots, [4, H, W, C].
+        calibration: order, sense and zero of the angles.
+        orientation: EXIF orientation of the shots.
+    """
     turned = np.stack([apply_orientation(picture, orientation) for picture in oriented(linear, calibration)])
     return oriented(turned, orientation_calibration(orientation))
 
 
-# Largest difference of the logarithms of equal exposures: files state three digits.
+# Largest difference of the logarithms of two equal exposures. Files state exposures with three digits.
 _EQUAL = 1e-3
 
 
 def light_of_files(
     views: Mapping[str, Sequence[Path]], advance: Advance | None = None
 ) -> tuple[dict[Path, float], str]:
-    """Return the exposure of each file by its EXIF tags, and a warning.
+    """Read the exposure of each file from its EXIF tags.
 
     Args:
         views: files of each view.
-        advance: receives the number of views that were read.
+        advance: callback for the number of views that were read.
 
     Returns:
-        The exposures of the files that state one, empty if files state different tags. The warning names the missing
-        tags in that case; otherwise it is empty.
+        The exposures of the files that state an exposure; and a warning, or "". If some files lack a tag that others
+        have, exposures cannot be compared. The result is then empty, and the warning names the missing tags.
 
     Raises:
         PolarguideError: a file cannot be read.
@@ -373,11 +400,11 @@ def light_of_files(
 def stated_exposures(
     views: Mapping[str, Sequence[Path]], advance: Advance | None = None
 ) -> tuple[dict[str, list[float]], str]:
-    """Return the relative exposures of each view by EXIF, with a geometric mean of 1, and a warning.
+    """Read the relative exposures of the pictures of each view from EXIF tags. Their geometric mean is 1.
 
     Returns:
-        The exposures of all views, empty if all are equal or files state different tags; and the warning of
-        ``light_of_files``.
+        The exposures of all views; and the warning of ``light_of_files``. The exposures are empty if all of them are
+        equal, or if the files cannot be compared.
     """
     stated, missing = light_of_files(views, advance)
     logs = {path: math.log(light) for path, light in stated.items()}
@@ -388,7 +415,7 @@ def stated_exposures(
 
 
 def exposure_notes(stated: Mapping[str, Sequence[float]]) -> list[str]:
-    """Return a note on the exposures that the files state."""
+    """Return a note for the user about the exposures that the files state."""
     if not stated:
         return []
     every = [value for exposures in stated.values() for value in exposures]
@@ -403,15 +430,18 @@ def exposure_notes(stated: Mapping[str, Sequence[float]]) -> list[str]:
 def exposures_of_view(
     names: Sequence[str], gray: NDArray[np.floating[Any]], usable: NDArray[np.bool_], stated: Sequence[float]
 ) -> tuple[Gains, str]:
-    """Return the exposures of four shots: those of their files, unless the pair sums contradict them significantly.
+    """Choose the exposures of the four shots of a view.
+
+    The exposures that the files state are used, unless the pair sums of the shots contradict them significantly.
 
     Args:
-        names: names of the shots, for messages.
-        gray: linear intensities [4, H, W]. usable: mask [H, W].
-        stated: exposures that the files state, or ones.
+        names: names of the shots for messages.
+        gray: linear intensities [4, H, W].
+        usable: mask of usable pixels, [H, W].
+        stated: exposures that the files state; 1 if they state no exposure.
 
     Returns:
-        Gains by which the shots are divided, and a warning if the pair sums contradict the files, else "".
+        The gains by which the shots are divided; and a warning if the pair sums contradict the files, otherwise "".
     """
     logs = np.log(np.asarray(stated, np.float64))
     mean = float(logs.mean())
@@ -438,15 +468,17 @@ def _as_gains(values: Iterable[float]) -> Gains:
 
 
 COMPARABLE = "Keep one kind: their brightness cannot be compared."
-"""Remedy for several kinds of files in one capture or set."""
+"""Remedy in the error for different kinds of files in one capture or view."""
 
 
 def require_one(where: Path, kinds: Iterable[tuple[str, Path]], expected: str, remedy: str) -> None:
-    """Refuse pictures that differ in a property that they must share, such as their size.
+    """Refuse pictures that differ in a property that must be equal, such as their size.
 
     Args:
-        where: folder of the pictures. kinds: value of the property and path of each file.
-        expected, remedy: texts of the error.
+        where: folder of the pictures.
+        kinds: value of the property and path of each file.
+        expected: text of the error.
+        remedy: text of the error.
 
     Raises:
         PolarguideError: two files differ. The message names the first file of each value.
@@ -467,12 +499,17 @@ def levels_of_capture(
     black: float = 0.0,
     stated: int | None = None,
 ) -> tuple[Levels, list[str]]:
-    """Return the levels of the stored values of a capture, and notes for the user.
+    """Estimate the levels (such as full scale) of the stored values of a capture.
 
     Args:
-        counts: number of occurrences of each stored value, from 0. container: bits of a value in the files.
-        options: ``bits`` and ``saturation``.
-        black: black level. stated: full scale that all files state.
+        counts: number of occurrences of each stored value, starting at the value 0.
+        container: number of bits of a value in the files.
+        options: options ``bits`` and ``saturation`` of the user.
+        black: stored value without light.
+        stated: full scale that all files state, or None.
+
+    Returns:
+        The levels, and notes for the user.
 
     Raises:
         PolarguideError: a value exceeds ``--bits``, or ``--saturation`` is out of range.
@@ -494,20 +531,28 @@ def levels_of_shot(
     black: float = 0.0,
     stated: int | None = None,
 ) -> tuple[Levels, list[str]]:
-    """Return the levels of the stored values of a single shot, and notes for the user.
+    """Estimate the levels (such as full scale) of the stored values of a single shot.
 
-    Values that pile up are saturated, but do not change the full scale, which all shots of a series share.
+    If many samples have the same largest value, they are saturated. This value does not become the full scale, because
+    all shots of a series must have the same full scale.
 
     Args:
-        values: [K, ...] stored values. bits: bits of a sensor value, if they are known.
-        container, options, black, stated: as for ``levels_of_capture``.
+        values: stored values, [K, ...].
+        container: see ``levels_of_capture``.
+        options: see ``levels_of_capture``.
+        bits: number of bits of a sensor value, or None if it is unknown.
+        black: see ``levels_of_capture``.
+        stated: see ``levels_of_capture``.
+
+    Returns:
+        The levels, and notes for the user.
 
     Raises:
         PolarguideError: a value exceeds ``--bits``, or ``--saturation`` is out of range.
     """
     largest = int(values.max())
     counts = None
-    # Values can pile up only if their maximum is a power of two minus 1. Counting takes longer than this test.
+    # Clipped values are a power of two minus 1. This test avoids the slow counting of all values.
     may_pile_up = container == 16 and largest < FULL_16 and largest & (largest + 1) == 0
     if may_pile_up and options.bits is None and options.saturation is None:
         parts = (np.bincount(part.ravel(), minlength=FULL_16 + 1) for part in values)
@@ -522,14 +567,18 @@ def levels_of_shot(
 def levels_of_pictures(
     paths: Sequence[Path], white: tuple[float, float, float], options: SampledOptions
 ) -> tuple[Levels | None, list[str]]:
-    """Return the levels of all pictures of a capture, and notes; None if every file states its full scale.
+    """Estimate the levels (such as full scale) of the stored values of all pictures of a capture.
 
     Args:
-        paths: files of the capture. white: gains of R, G and B, for camera raw files.
-        options: as for ``levels_of_capture``.
+        paths: files of the capture.
+        white: gains of R, G and B for camera raw files.
+        options: options ``bits`` and ``saturation`` of the user.
+
+    Returns:
+        The levels, and notes for the user. The levels are None if the full scale of each file is known.
 
     Raises:
-        PolarguideError: as for ``levels_of_capture``.
+        PolarguideError: a value exceeds ``--bits``, or ``--saturation`` is out of range.
     """
     wide = [path for path in paths if not is_camera_raw(path) and may_use_fewer_bits(path)]
     if not wide and options.bits is None and options.saturation is None:
@@ -546,16 +595,17 @@ def levels_of_pictures(
 
 @dataclass(frozen=True, eq=False)
 class LinearShots:
-    """Linear intensities of the shots of a view, of which four may be aligned.
+    """Linear intensities of the K shots of a view. If there are four shots, they may be aligned.
 
     Attributes:
-        values: [K, H, W, 3] linear intensities, full scale 1.
-        saturated: pixels with a saturated sample, [H, W].
-        dark: pixels without light in any shot, [H, W].
-        outside: pixels that the alignment moved out of a shot, [H, W].
-        shifts: shifts of the shots.
+        values: linear intensities, [K, H, W, 3]; full scale is 1.
+        saturated: mask of the pixels that are saturated in some shot, [H, W].
+        dark: mask of the pixels that are 0 in all shots, [H, W].
+        outside: mask of the pixels that are outside the picture of some shot after the alignment, [H, W].
+        shifts: estimated shifts of the shots.
         orientation: EXIF orientation of the shots.
-        clipped_share, dark_share: shares of such pixels before the alignment.
+        clipped_share: share of the saturated pixels before the alignment.
+        dark_share: share of the dark pixels before the alignment.
     """
 
     values: NDArray[np.float32]
@@ -569,12 +619,12 @@ class LinearShots:
 
     @property
     def invalid(self) -> NDArray[np.bool_]:
-        """Pixels without a measurement, [H, W]."""
+        """Mask of the pixels that are saturated, dark or outside the picture of a shot, [H, W]."""
         return self.saturated | self.dark | self.outside
 
     @classmethod
     def of(cls, shots: Shots, transfer: str, *, align: bool) -> LinearShots:
-        """Decode the stored values, and align the shots if ``align``."""
+        """Convert the stored values of shots to linear intensities, and correct shifts of the shots if ``align``."""
         values = linear_codes(shots.pictures, transfer).astype(np.float32) / np.float32(FULL_CODE)
         shifts = estimate_shifts(values) if align else [Shift(0.0, 0.0, True)] * len(values)
         values, (saturated, dark), outside = align_shots(values, (shots.clipped, shots.dark), shifts)
@@ -595,11 +645,13 @@ class LinearShots:
         """Divide four shots by their exposures.
 
         Args:
-            names: names of the shots, for messages. stated: exposures that the files state, or ones.
-            options: ``gains`` auto without gains of a calibration measures exposures by the pair sums.
+            names: names of the shots for messages.
+            stated: exposures that the files state; 1 if they state no exposure.
+            options: options of the user. If ``gains`` is auto and no calibration specifies gains, the exposures are
+                also measured from the pair sums.
 
         Returns:
-            The intensities, the exposures, and the warning of ``exposures_of_view``.
+            The divided intensities, the exposures, and the warning of ``exposures_of_view``.
         """
         exposures = _as_gains(stated)
         warning = ""

@@ -1,4 +1,4 @@
-"""Exposures of views: angle of the polarizer, presence of a polarizer, and gain, read from file names and tables."""
+"""Polarizer angle and gain of each picture of a view, read from file names or from a table."""
 
 from __future__ import annotations
 
@@ -25,13 +25,16 @@ from polarguide.geometry.polarizer import ANGLES
 from polarguide.optics import Mount
 
 Angle = float | Literal["unknown", "none"]
-"""Degrees counter-clockwise from the picture's horizontal, modulo 180; or a word."""
+"""Polarizer angle in degrees counter-clockwise from the picture's horizontal, or a word.
+
+"unknown" means a polarizer at an unknown angle, "none" means a picture without a polarizer.
+"""
 LARGEST = 3600.0
 """Largest absolute angle in degrees that is accepted."""
 
 
 def parse_angle(text: str) -> Angle | None:
-    """Parse an angle or one of the two words; None for other texts."""
+    """Parse an angle in degrees, "unknown" or "none". Return None for any other text."""
     word = text.strip().lower()
     words: dict[str, Angle] = {"unknown": "unknown", "none": "none"}
     if word in words:
@@ -41,7 +44,10 @@ def parse_angle(text: str) -> Angle | None:
 
 
 def turned(angle: Angle, calibration: Calibration) -> Angle:
-    """Apply sense and zero of a calibration to an angle: ``sense * angle + zero`` in degrees, in [0, 180)."""
+    """Return the angle as displayed, ``sense * angle + zero`` in degrees, in [0, 180).
+
+    ``calibration`` has the sense and the zero. The words "unknown" and "none" are returned unchanged.
+    """
     if isinstance(angle, str):
         return angle
     sign = -1 if calibration.sense == "cw" else 1
@@ -49,12 +55,15 @@ def turned(angle: Angle, calibration: Calibration) -> Angle:
 
 
 def angle_text(angle: Angle) -> str:
-    """Return an angle as text for tables."""
+    """Format an angle or word for a table of angles."""
     return angle if isinstance(angle, str) else f"{angle:.10g}"
 
 
 def angle_labels(angles: Sequence[Angle]) -> list[str]:
-    """Return labels of the pictures of a view for file names: 045, 012.5, unknown, none, unknown-2, ..."""
+    """Return a different label for each picture of a view, for file names.
+
+    Labels are angles such as ``045`` and ``012.5``, or words. A repeated word gets a number, such as ``unknown-2``.
+    """
     labels: list[str] = []
     for angle in angles:
         label = angle if isinstance(angle, str) else f"{angle % 180:06.2f}".rstrip("0").rstrip(".")
@@ -64,19 +73,26 @@ def angle_labels(angles: Sequence[Angle]) -> list[str]:
 
 
 WELL_CONDITIONED = 0.15
-"""Smallest ``conditioning`` of analyzers for which Stokes vectors are computed; 0/45/90/135 have 0.71."""
+"""Smallest ``conditioning`` of polarizer angles for which Stokes vectors are computed.
+
+The angles 0, 45, 90 and 135 degrees have a conditioning of 0.71.
+"""
 BALANCED = 0.05
-"""Largest length of the mean analyzer for which the mean intensity is S0/2: a right angle set to 1.4 degrees."""
+"""Largest length of the mean analyzer for which the mean intensity counts as ``S0 / 2``.
+
+Two pictures at a right angle have this length if the angle is off by about 3 degrees.
+"""
 
 
 @dataclass(frozen=True)
 class Exposure:
-    """One picture of a view.
+    """Polarizer angle and gain of one picture of a view.
 
     Attributes:
-        angle: angle of the polarizer in degrees, in [0, 180); None without a polarizer or for an unknown angle.
-        filtered: True with a polarizer in front of the lens or the sensor.
-        gain: exposure relative to the other pictures of the scene. Values are divided by it.
+        angle: angle of the polarizer in degrees, in [0, 180). It is None if the angle is unknown, or if there is no
+            polarizer.
+        filtered: True if a polarizer was in front of the lens or the sensor.
+        gain: brightness of the exposure relative to the other pictures of the scene. Pixel values are divided by it.
     """
 
     angle: float | None = None
@@ -85,7 +101,7 @@ class Exposure:
 
     @property
     def known(self) -> bool:
-        """True if the picture has a known angle or no polarizer."""
+        """True if the angle of the polarizer is known, or if there is no polarizer."""
         return self.angle is not None or not self.filtered
 
     @property
@@ -95,13 +111,16 @@ class Exposure:
 
 
 FOUR = tuple(Exposure(float(angle)) for angle in ANGLES)
-"""Exposures of a view of a polarization camera."""
+"""Exposures of a polarization camera: 0, 45, 90 and 135 degrees with gain 1."""
 PLAIN = (Exposure(filtered=False),)
-"""Exposures of an ordinary photograph."""
+"""Exposures of a view with one photograph without a polarizer."""
 
 
 def nominal(exposures: Sequence[Exposure]) -> Tensor:
-    """Return the analyzers [K, 2] of known exposures on the optical axis, float64; (0, 0) without a filter."""
+    """Return ``(cos 2t, sin 2t)`` of the polarizer angle t of each exposure, [K, 2] float64.
+
+    The pair is (0, 0) for a picture without a filter. All angles must be known.
+    """
     axis = torch.zeros(1, 3, dtype=torch.float64)
     none = torch.zeros(2, dtype=torch.float64)
     cosines = [none if e.angle is None else optics.analyzer(math.radians(e.angle), axis) for e in exposures]
@@ -109,12 +128,17 @@ def nominal(exposures: Sequence[Exposure]) -> Tensor:
 
 
 def analyzers(exposures: Sequence[Exposure], rays: Tensor, mount: Mount) -> Tensor:
-    """Return the analyzers of known exposures: [K, 2], or [K, 2, H, W] for a filter in front of the lens.
+    """Return ``(cos 2t, sin 2t)`` of the effective polarizer angle t of each exposure.
+
+    The effective angle behind a filter in front of the lens depends on the pixel.
 
     Args:
-        exposures: known exposures.
-        rays: unit rays [H, W, 3] in camera axes.
+        exposures: exposures with known angles.
+        rays: unit rays of the pixels in camera axes, [H, W, 3].
         mount: place of the polarizer.
+
+    Returns:
+        [K, 2] for a polarizer on the sensor, [K, 2, H, W] for a filter in front of the lens.
     """
     if mount == "sensor":
         return nominal(exposures).to(rays)
@@ -125,12 +149,14 @@ def analyzers(exposures: Sequence[Exposure], rays: Tensor, mount: Mount) -> Tens
 
 
 def conditioning(analyzers: Tensor) -> float:
-    """Return the smallest over the largest singular value of the rows (1, cos 2t, sin 2t).
+    """Measure how well polarizer angles determine a Stokes vector.
 
-    Evenly spread angles have 0.71. Angles that do not determine a Stokes vector have 0.
+    The result is the ratio of the smallest to the largest singular value of the matrix with a row
+    ``(1, cos 2t, sin 2t)`` for each angle t. It is 0.71 for evenly spread angles, and 0 for angles that do not
+    determine a Stokes vector.
 
     Args:
-        analyzers: pairs (cos 2t, sin 2t), [K, 2].
+        analyzers: ``(cos 2t, sin 2t)`` of each angle, [K, 2].
     """
     if len(analyzers) < 3:
         return 0.0
@@ -140,19 +166,23 @@ def conditioning(analyzers: Tensor) -> float:
 
 
 def determine_stokes(exposures: Sequence[Exposure]) -> bool:
-    """Return True if the known exposures determine a well-conditioned Stokes vector at every pixel."""
+    """Return True if the exposures with known angles determine Stokes vectors, see ``WELL_CONDITIONED``."""
     return conditioning(nominal([e for e in exposures if e.known])) >= WELL_CONDITIONED
 
 
 def measure_radiance(exposures: Sequence[Exposure]) -> bool:
-    """Return True if S0 is measured: without a filter, by a pair at right angles, or by a full Stokes vector."""
+    """Return True if the exposures measure S0.
+
+    S0 follows from a picture without a filter, from two pictures at a right angle, or from a full Stokes vector.
+    """
     return determine_stokes(exposures) or bool(radiance_places(exposures))
 
 
 def radiance_places(exposures: Sequence[Exposure]) -> tuple[int, ...]:
-    """Return the indices of the exposures whose mean is S0/2.
+    """Return the indices of the exposures whose mean is ``S0 / 2``.
 
-    These are the exposures without a filter, else all known ones if they are balanced, else none.
+    If there are exposures without a filter, return their indices. Otherwise return the indices of all exposures with
+    known angles, if their mean is ``S0 / 2`` for any polarization (see ``BALANCED``). Otherwise return no index.
     """
     plain = tuple(k for k, e in enumerate(exposures) if not e.filtered)
     if plain:
@@ -169,7 +199,7 @@ def normalized(angle: float) -> float:
 
 
 def with_estimate(exposure: Exposure, angle: float, gain: float) -> Exposure:
-    """Return an exposure with an estimated angle in degrees and gain."""
+    """Return an exposure with its angle in degrees and its gain replaced by estimates."""
     return replace(exposure, angle=normalized(angle), gain=gain)
 
 
@@ -185,15 +215,15 @@ _REMEDY = "Use the columns file, angle (degrees, unknown or none) and optionally
 
 @dataclass(frozen=True)
 class Line:
-    """One line of the table of angles.
+    """One line of the table of angles, ``angles.csv``.
 
     Attributes:
-        number: line number, from 1.
-        file: normalized name of the picture: in ``polar/`` of a scene, else relative to the folder of photographs.
-        view: view of the picture; None for a view of its own, named like the file without suffix. All pictures of a
-            view share a pose.
+        number: number of the line; the first line of the file is 1.
+        file: normalized name of the picture, relative to ``polar/`` of a scene or to the folder of the photographs.
+        view: name of the picture's view. All pictures of a view share a pose. If it is None, the view has only this
+            picture and the name of the file without suffix.
         angle: angle of the polarizer.
-        gain: exposure relative to the other pictures; None for an empty cell.
+        gain: exposure relative to the other pictures; None if the cell is empty.
     """
 
     number: int
@@ -204,7 +234,7 @@ class Line:
 
     @property
     def exposure(self) -> Exposure:
-        """The exposure, with a gain of 1 for an empty cell."""
+        """Exposure with the angle and gain of the line. The gain is 1 if its cell is empty."""
         gain = 1.0 if self.gain is None else self.gain
         if isinstance(self.angle, str):
             return Exposure(filtered=self.angle == "unknown", gain=gain)
@@ -212,11 +242,11 @@ class Line:
 
 
 def read_table(path: Path) -> list[Line]:
-    """Return the lines of a table in their order. Empty cells at the end of a line may be missing.
+    """Read the lines of a table of angles. A line may omit empty cells at its end.
 
     Raises:
         PolarguideError: the table cannot be read, a column is missing or unknown, a file is listed twice, or an angle
-            or gain is invalid. The error names the line.
+            or gain is invalid. The message names the line.
     """
     rows = read_rows(path, _REMEDY)
     columns = _header(path, rows[0][1] if rows else [])
@@ -236,10 +266,10 @@ def read_table(path: Path) -> list[Line]:
 
 
 def files_of(root: Path, table: Path, lines: Sequence[Line]) -> list[Path]:
-    """Return the path of each line as the file system spells it. The files need not exist.
+    """Return the path of each line's picture, spelled like the file on disk. A file may be missing.
 
     Raises:
-        PolarguideError: two lines name one file.
+        PolarguideError: two lines name the same file.
     """
     files = [stored(root / line.file) for line in lines]
     first: dict[str, Line] = {}
@@ -274,7 +304,7 @@ def _header(path: Path, row: list[str]) -> list[str]:
 
 
 def _line(where: str, number: int, cells: Mapping[str, str]) -> Line:
-    """Parse a line from its cells by column."""
+    """Create a line from the text of its cells by column."""
     file = cells["file"]
     if not file:
         raise PolarguideError(where, expected="the name of a file", found="an empty cell", remedy=_REMEDY)
@@ -300,17 +330,17 @@ def _line(where: str, number: int, cells: Mapping[str, str]) -> Line:
 
 
 def _cell(text: str) -> str:
-    """Return the text of an invalid number for messages."""
+    """Format a cell with an invalid number for an error message."""
     comma = decimal_comma([text])
     return f"{comma} with a decimal comma; numbers have a point" if comma else shortened(text)
 
 
 def table_text(lines: Iterable[tuple[str, str, Exposure, float | None, str]]) -> str:
-    """Return a table as CSV text.
+    """Format a table of angles as CSV text.
 
     Args:
-        lines: file, view, exposure, modulation (see ``FittedAngle``; None if it was not fitted) and note of each
-            picture.
+        lines: tuple of file, view, exposure, modulation and note for each picture. The modulation (see
+            ``FittedAngle``) is None if it was not fitted.
     """
     rows: list[list[object]] = [[*_COLUMNS]]
     for file, view, exposure, modulation, note in lines:
@@ -322,7 +352,7 @@ def table_text(lines: Iterable[tuple[str, str, Exposure, float | None, str]]) ->
 
 
 FEWEST = 3
-"""Smallest number of different angles that determines a Stokes vector."""
+"""Smallest number of different angles that determine a Stokes vector."""
 NAMING = (
     "Name files like cup_045.jpg, cup_a30.jpg, cup_unknown.jpg or cup_none.jpg (numbers without a letter must be "
     "multiples of 15 or evenly spaced over half a turn); or write angles.csv with the columns file,angle; or use "
@@ -330,19 +360,20 @@ NAMING = (
 )
 _WORDS = "unknown|none"
 _NUMBER = r"(?P<mark>angle|pol|a|i)?[-_ ]?(?P<angle>\d{1,3}(?:\.\d+)?)(?P<unit>deg)?"
-# A minus before a number is its sign if another separator precedes it: cup_-45, but not cup-45.
+# A hyphen before a number is a minus only after another separator: cup_-45 means -45, cup-45 means 45.
 _APART = r"(?:[-_ .]*[_ .](?P<minus>-)(?=\d)|[-_ .]+)"
 _SINGLE = re.compile(rf"(?P<view>.+?){_APART}(?:{_NUMBER}|(?P<word>{_WORDS}))", re.IGNORECASE)
-# Degrees between the marks of a filter's ring. Other numbers need a letter because they may count pictures.
+# Degrees between the marks on the ring of a filter. A number that is no multiple of it may count pictures, so it is an
+# angle only with a letter or a unit.
 _MARKS = 15
 _NUMBERED = re.compile(rf"(?:(?P<view>.+?){_APART}|(?P<alone>-))?(?P<number>\d{{1,3}}(?:\.\d+)?)")
 _SMALLEST_STEP = 2.0
-"""Smallest step of evenly spaced angles in degrees. Numbers that increase by one may count pictures."""
+"""Smallest step of evenly spaced angles in degrees. Numbers with a smaller step may count pictures."""
 _ALIKE = 1e-6
 
 
 def folders_of_angles(root: Path) -> dict[Path, Angle]:
-    """Return the subfolders named like angles with their angles, in the order of their names."""
+    """Return the angle of each subfolder whose name is an angle, sorted by name."""
     folders = [path for path in sorted(root.iterdir()) if path.is_dir()]
     names = angles_of_names([path.name for path in folders], folders=True)
     return {
@@ -351,15 +382,16 @@ def folders_of_angles(root: Path) -> dict[Path, Angle]:
 
 
 def angles_of_names(names: Sequence[str], *, folders: bool = False) -> list[tuple[str, Angle] | None]:
-    """Return the view and angle that each name states; None for a name without an angle.
+    """Split each name into view and angle. The result is None for a name without an angle.
 
-    The view is "" for a name that is an angle alone. A number with a letter or a unit is an angle, and so is a multiple
-    of 15 below 180. Other numbers are angles if all numbers of a view are evenly spaced over half a turn or a whole
-    one, such as 10, 40, ..., 160.
+    A number is an angle if it has a letter or a unit, or if it is a multiple of 15 that is less than 180. Other numbers
+    are angles if all numbers of a view are evenly spaced over a half or a full turn, such as 10, 40, ..., 160. If a
+    name consists of an angle only, its view is "".
 
     Args:
         names: file names without suffix, or names of folders.
-        folders: True for names of folders. A name such as I_10 is then an angle alone, without a view I.
+        folders: True if the names are those of folders. The name I_10 is then the angle 10 without a view, and not the
+            angle 10 of a view I.
     """
     stated = [_stated(name, folders) for name in names]
     numbered: dict[str, list[tuple[int, float]]] = {}
@@ -377,7 +409,7 @@ def angles_of_names(names: Sequence[str], *, folders: bool = False) -> list[tupl
 
 
 def _stated(name: str, folder: bool) -> tuple[str, Angle] | None:
-    """Return view and angle of one name of a picture or folder."""
+    """Return the view and the angle in the name of a picture or a folder, or None."""
     parts = None if folder else split_name(name)
     if parts is None and (alone := split_name(f"x_{name}")) is not None and alone[0] == "x":
         return "", alone[1]
@@ -385,7 +417,10 @@ def _stated(name: str, folder: bool) -> tuple[str, Angle] | None:
 
 
 def covers_turn(angles: Sequence[float]) -> bool:
-    """Return True if angles in degrees are evenly spaced over 180 or 360 degrees, with or without the end."""
+    """Return True if angles in degrees are evenly spaced over a half or a full turn.
+
+    The last angle may repeat the first one, such as 180 after 0.
+    """
     different = sorted(set(angles))
     if len(different) < FEWEST:
         return False
@@ -398,14 +433,14 @@ def covers_turn(angles: Sequence[float]) -> bool:
 
 
 def split_name(stem: str) -> tuple[str, Angle] | None:
-    """Return view and angle that a file name states; None without an angle."""
+    """Split a file name into view and angle. Return None if it has no angle."""
     match = _SINGLE.fullmatch(stem)
     angle = None if match is None else _angle_of(match)
     return None if match is None or angle is None else (match["view"], angle)
 
 
 def _angle_of(match: re.Match[str]) -> Angle | None:
-    """Return the angle of a matched name; None for a number that may count pictures."""
+    """Return the angle of a matched name. Return None if its number may count pictures instead."""
     if match["word"]:
         return parse_angle(match["word"])
     number = -float(match["angle"]) if match["minus"] else float(match["angle"])

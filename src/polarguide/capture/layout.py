@@ -1,4 +1,7 @@
-"""Find the files of a capture, with pictures in ``polar/`` or in a folder per angle, and check their memory."""
+"""Find the files of a capture, and check that its pictures fit into memory.
+
+The pictures are in the folder ``polar/``, or in one folder for each angle.
+"""
 
 from __future__ import annotations
 
@@ -31,16 +34,19 @@ _HINT = (
 
 @dataclass(frozen=True)
 class CaptureFiles:
-    """Files of a capture.
+    """Paths of the files of a capture by view.
 
     Attributes:
         root: folder of the capture.
-        pictures: files by view and by angle in degrees, of views with pictures at 0, 45, 90 and 135 degrees.
-            ``select_views`` checks for missing angles.
-        masks, materials, invalid, ground_truth: optional files by view.
+        pictures: path of each picture by view and angle, for the views with pictures at 0, 45, 90 and 135 degrees.
+            An angle may be missing; ``select_views`` refuses such a view.
+        masks: foreground masks by view; some views may have no mask.
+        invalid: masks of unusable pixels by view; some views may have no mask.
+        ground_truth: files of the ground truth by view; some views may have no file.
         warnings: warnings about unused files.
-        others: files and their exposures by view, of views with other pictures according to ``angles.csv``.
-        table: ``angles.csv``, if it exists.
+        others: paths and exposures of the pictures by view, for the views with other angles in ``angles.csv``.
+        table: path of ``angles.csv``, or None if the file does not exist.
+        materials: label pictures of materials by view; some views may have no picture.
     """
 
     root: Path
@@ -59,13 +65,13 @@ class CaptureFiles:
         return sorted(self.pictures.keys() | self.others.keys())
 
     def files(self, name: str) -> list[Path]:
-        """Return the pictures of a complete view, in the order of its exposures."""
+        """Return the paths of a view's pictures in the order of its exposures. No picture may be missing."""
         if name in self.others:
             return [path for path, _ in self.others[name]]
         return [self.pictures[name][angle] for angle in ANGLES]
 
     def exposures(self, name: str) -> tuple[Exposure, ...]:
-        """Return the exposures of a view's pictures."""
+        """Return polarizer angle and gain of each picture of a view."""
         return tuple(e for _, e in self.others[name]) if name in self.others else FOUR
 
 
@@ -120,7 +126,7 @@ def find_layout(root: Path) -> CaptureFiles:
 
 
 def refuse_scene(out: Path) -> None:
-    """Refuse an output folder that is a scene, or one of its folders.
+    """Refuse an output folder that is a scene or a folder inside a scene.
 
     Raises:
         PolarguideError: the folder belongs to a scene.
@@ -143,10 +149,10 @@ def _is_scene(folder: Path) -> bool:
 
 
 def select_views(layout: CaptureFiles, views: Sequence[str] | None) -> list[str]:
-    """Return the requested view names, sorted; default: all.
+    """Validate the requested view names and return them, sorted. By default, return the names of all views.
 
     Raises:
-        PolarguideError: a name is unknown, the list is empty, or a view lacks an angle.
+        PolarguideError: a name is unknown, the list is empty, or a view lacks the picture of an angle.
     """
     if views is None:
         names = layout.names
@@ -192,7 +198,11 @@ def _require_complete(layout: CaptureFiles, names: list[str]) -> None:
 def _read_flat(
     folder: Path, warnings: list[str], table: Path | None
 ) -> tuple[dict[str, dict[int, Path]], dict[str, tuple[tuple[Path, Exposure], ...]]]:
-    """Find ``polar/<view>_<angle>.<suffix>`` and the pictures of a table."""
+    """Find the pictures ``<view>_<angle>.<suffix>`` in the folder ``polar/``, and those that a table lists.
+
+    Returns:
+        The attributes ``pictures`` and ``others`` of ``CaptureFiles``.
+    """
     lines = read_table(table) if table is not None else []
     stored = {canonical(path.name): path for path in list_files(folder, SUFFIXES)}
     for item in lines:
@@ -224,7 +234,10 @@ def _read_flat(
 def _take_listed(
     pictures: dict[str, dict[int, Path]], lines: Sequence[Line], stored: Mapping[str, Path]
 ) -> dict[str, tuple[tuple[Path, Exposure], ...]]:
-    """Add a table's views with one picture at each of the four angles to ``pictures`` and return its other views."""
+    """Group the pictures of a table by view, and return the views with other angles than 0, 45, 90 and 135 degrees.
+
+    A view with one picture at each of these four angles is added to ``pictures`` instead.
+    """
     views: dict[str, list[tuple[Path, Exposure]]] = {}
     for item in lines:
         views.setdefault(item.view or stem_of(Path(item.file)), []).append((stored[item.file], item.exposure))
@@ -241,10 +254,10 @@ def _take_listed(
 
 
 def require_angle_folders(root: Path, folders: Mapping[int, Path]) -> None:
-    """Check that each angle has a folder.
+    """Check that 0, 45, 90 and 135 degrees each have a folder.
 
     Raises:
-        PolarguideError: an angle has no folder.
+        PolarguideError: a folder is missing.
     """
     missing = [angle for angle in ANGLES if angle not in folders]
     require(
@@ -257,7 +270,10 @@ def require_angle_folders(root: Path, folders: Mapping[int, Path]) -> None:
 
 
 def angle_folders(root: Path) -> dict[int, Path]:
-    """Find folders named like a polarizer angle (I-00, I_45, 090, pol135), or a set such as image_0, image_45, ...
+    """Return the folders of polarizer angles by angle in degrees; empty without such folders.
+
+    Their names are angles, such as ``I-00``, ``I_45``, ``090`` or ``pol135``. Otherwise, four folders whose names
+    differ in one number are accepted: ``image_0``, ``image_45``, ``image_90`` and ``image_135``.
 
     Raises:
         PolarguideError: two folders have the same angle.
@@ -275,7 +291,10 @@ def angle_folders(root: Path) -> dict[int, Path]:
 
 
 def _numbered_folders(folders: Sequence[Path]) -> dict[int, Path]:
-    """Return the only four folders whose names differ in one number, 0, 45, 90 and 135; else an empty dictionary."""
+    """Return four folders by angle whose names differ in one number: 0, 45, 90 or 135.
+
+    The result is empty if there are no such folders, or several sets of them.
+    """
     sets: dict[tuple[str, str], dict[int, Path]] = {}
     for path in folders:
         for match in _NUMBER.finditer(path.name):
@@ -285,15 +304,21 @@ def _numbered_folders(folders: Sequence[Path]) -> dict[int, Path]:
 
 
 def angle_of_folder(path: Path) -> int | None:
-    """Return the polarizer angle in a folder's name; None for other names."""
+    """Return the polarizer angle in degrees in a folder's name. Return None if the name is no angle."""
     match = _ANGLE_FOLDER.fullmatch(path.name)
     return int(match["angle"]) if match is not None and int(match["angle"]) in ANGLES else None
 
 
 def index_files(folder: Path, suffixes: tuple[str, ...], ignored: Container[str] = ()) -> dict[str, Path]:
-    """Return the files of a folder with one of the suffixes by stem (``canonical``), except for ignored names.
+    """Return the files of a folder by stem. A missing folder has no files.
 
-    A missing folder has no files.
+    Args:
+        folder: the folder.
+        suffixes: suffixes of the files to return.
+        ignored: names of files to leave out, in the form of ``canonical``.
+
+    Raises:
+        PolarguideError: two files have the same stem.
     """
     files: dict[str, Path] = {}
     for path in list_files(folder, suffixes):
@@ -323,7 +348,7 @@ def list_files(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
 
 
 def ambiguous(folder: Path, expected: str, first: Path, second: Path) -> PolarguideError:
-    """Return the error of two files of a folder with the same meaning."""
+    """Return the error for two files of which only one is expected, such as two pictures of one view and angle."""
     same = first.name == second.name
     names = [f"{path.parent.name}/{path.name}" if same else path.name for path in (first, second)]
     return PolarguideError(
@@ -339,13 +364,13 @@ def describe_contents(root: Path) -> str:
 
 GIBIBYTE = 1 << 30
 SHARE = 0.8
-"""Default share of the free memory that pictures may take."""
+"""Share of the free memory that pictures may take by default."""
 MASKS = 2 + 4
-"""Bytes for each pixel of a view without codes: peak, black, invalid, saturated, mask."""
+"""Number of bytes per pixel that a view without its pictures takes: peak, black, invalid, saturated and mask."""
 KEPT = 4 * 3 * 2 + MASKS
-"""Bytes for each pixel of a view with the codes of four pictures in three channels."""
+"""Number of bytes per pixel that a view with four pictures of three channels takes."""
 READ = 4 * 3 * 2 * 3
-"""Bytes for each pixel while a view is read: decoded pictures, their linear codes, and single channels."""
+"""Number of bytes per pixel that reading a view takes: decoded pictures, their linear codes, and single channels."""
 
 
 def check_memory(
@@ -362,7 +387,7 @@ def check_memory(
     Args:
         layout: files of the capture.
         names: names of the views to read.
-        factor: side of the averaged boxes.
+        factor: side of the pixel boxes that are averaged.
         at_once: number of views that are read concurrently.
         limit: memory limit in GiB; default: 80 % of the free memory.
         hold: if True, the pictures stay in memory.
@@ -386,9 +411,10 @@ def require_memory_of_each(paths: Sequence[Path], pixel: int, what: str, *, reme
     """Refuse files that are processed one after the other if the largest does not fit into memory.
 
     Args:
-        paths: pictures and arrays; files without a size in their header are ignored.
-        pixel: required bytes per pixel.
-        what, remedy: description of the files and remedy for messages.
+        paths: paths of pictures and arrays. Files whose header states no size are ignored.
+        pixel: number of bytes per pixel that the work takes.
+        what: description of the files for the error message.
+        remedy: remedy in the error message.
 
     Raises:
         PolarguideError: the largest file does not fit.
@@ -401,15 +427,17 @@ def require_memory_of_each(paths: Sequence[Path], pixel: int, what: str, *, reme
 
 
 def require_memory(where: Path, needed: int, what: str, *, remedy: str, limit: float | None = None) -> None:
-    """Refuse work that takes more memory than available.
+    """Refuse work that takes more memory than the limit.
 
     Args:
-        where, what, remedy: place, description and remedy for messages.
-        needed: required bytes.
+        where: file or folder that the error message names.
+        needed: number of bytes that the work takes.
+        what: description of the pictures for the error message.
+        remedy: remedy in the error message.
         limit: memory limit in GiB; default: 80 % of the free memory.
 
     Raises:
-        PolarguideError: the limit is lower.
+        PolarguideError: the work takes more memory than the limit.
     """
     allowed = int(SHARE * free_memory()) if limit is None else int(limit * GIBIBYTE)
     source = f"{SHARE:.0%} of the free memory" if limit is None else "the limit by --memory"
@@ -423,9 +451,10 @@ def require_memory(where: Path, needed: int, what: str, *, remedy: str, limit: f
 
 
 def stated_pixels(layout: CaptureFiles, names: Sequence[str]) -> list[int]:
-    """Return the number of pixels of each view's largest picture, scaled up for more than four pictures.
+    """Return the number of pixels of each view, for estimates of memory.
 
-    The number is 0 if headers state no size.
+    It is the number of pixels of the view's largest picture according to the header. For K > 4 pictures, it is
+    multiplied by K / 4. It is 0 if the headers state no size.
     """
     counts = []
     for name in names:

@@ -1,4 +1,4 @@
-"""Files next to the pictures: ``split.json``, ``scene.json``, and the ground truth of views, ``gt/<view>.npz``."""
+"""Parse the optional files of a scene: ``split.json``, ``scene.json``, and ground truth in ``gt/<view>.npz``."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ from polarguide.optics import Mount
 
 LEAST_INDEX = 1.0
 LARGEST_INDEX = 4.0
-# First number in materials/ that scene.json defines.
+# Smallest label in materials/ that stands for a dielectric whose refractive index is in scene.json.
 FIRST_LISTED = 3
 Index = Annotated[float, msgspec.Meta(gt=LEAST_INDEX, lt=LARGEST_INDEX)]
 
 
 class _Split(msgspec.Struct):
-    """Held-out views in ``split.json``; other fields are ignored."""
+    """Fields of ``split.json``. Unknown fields are ignored."""
 
     test: list[str]
 
@@ -44,7 +44,7 @@ class _Object(msgspec.Struct):
 
 
 class _Dielectric(msgspec.Struct):
-    """Dielectric with a number in ``materials/``."""
+    """Entry of ``scene.json`` for a dielectric that has a number in ``materials/``."""
 
     refractive_index: Index
 
@@ -56,7 +56,7 @@ class _Materials(msgspec.Struct):
 
 
 class _Scene(msgspec.Struct):
-    """Fields of ``scene.json``; others are ignored."""
+    """Fields of ``scene.json``. Unknown fields are ignored."""
 
     refractive_index: Index | None = None
     objects: list[_Object] = []
@@ -66,13 +66,13 @@ class _Scene(msgspec.Struct):
 
 
 class _Polarizer(msgspec.Struct):
-    """Place of the polarizer in ``scene.json``."""
+    """Field of ``scene.json`` for the place of the polarizer."""
 
     polarizer: Mount = "sensor"
 
 
 class _Angles(msgspec.Struct):
-    """Calibration in ``scene.json``."""
+    """Fields of ``scene.json`` for the calibration of the polarizer angles."""
 
     order: tuple[int, int, int, int] = ANGLES
     sense: Sense = "ccw"
@@ -83,7 +83,7 @@ class _Angles(msgspec.Struct):
 
 
 class _Prepared(msgspec.Struct):
-    """Changes of the angles by ``prepare`` and ``inspect --fix``."""
+    """Fields of ``scene.json`` for the changes of the polarizer angles by ``prepare`` and ``inspect --fix``."""
 
     calibration: _Angles | None = None
     corrections: list[_Angles] = []
@@ -116,7 +116,10 @@ def held_out(path: Path, data: bytes, names: list[str]) -> tuple[str, ...]:
 
 
 def refractive_index_of(path: Path, data: bytes) -> float | None:
-    """Return the refractive index in ``scene.json``: ``refractive_index``, or the common ``ior`` of objects, or None.
+    """Return the refractive index in ``scene.json``, or None if the file does not state it.
+
+    It is the field ``refractive_index``. Without this field, it is the field ``ior`` of the objects, if all of them
+    have the same value.
 
     Args:
         path: path of ``scene.json`` for messages.
@@ -135,9 +138,10 @@ def refractive_index_of(path: Path, data: bytes) -> float | None:
 
 
 def indices_of(path: Path, data: bytes) -> dict[int, float]:
-    """Return the refractive indices of dielectrics by their number in ``materials/``, from 3 on.
+    """Return the refractive index of each dielectric that has a number in ``materials/``.
 
-    They are in ``materials`` of ``scene.json``, as ``{"3": {"refractive_index": 1.33}}``.
+    The numbers start at 3. The indices are in the field ``materials`` of ``scene.json``, for example
+    ``{"3": {"refractive_index": 1.33}}``.
 
     Args:
         path: path of ``scene.json`` for messages.
@@ -161,7 +165,7 @@ def indices_of(path: Path, data: bytes) -> dict[int, float]:
 
 
 def mount_of(path: Path, data: bytes) -> Mount:
-    """Return the place of the polarizer: ``polarizer`` in ``scene.json``, by default "sensor".
+    """Return the place of the polarizer. It is the field ``polarizer`` of ``scene.json``, by default "sensor".
 
     Args:
         path: path of ``scene.json`` for messages.
@@ -179,7 +183,7 @@ def mount_of(path: Path, data: bytes) -> Mount:
 
 
 def keeps_gains(path: Path, data: bytes) -> bool:
-    """Return True for a scene of ``prepare --gains none``, which does not change exposures.
+    """Return True if the scene was prepared with ``--gains none``, so exposures must not be corrected.
 
     Args:
         path: path of ``scene.json`` for messages.
@@ -192,14 +196,14 @@ def keeps_gains(path: Path, data: bytes) -> bool:
 
 
 def applied_calibration(path: Path, data: bytes) -> Calibration | None:
-    """Return order, sense and zero of a prepared scene's pictures, including corrections.
+    """Return the order, sense and zero that ``prepare`` and ``inspect --fix`` applied to the pictures of a scene.
 
     Args:
         path: path of ``scene.json`` for messages.
         data: its content.
 
     Returns:
-        The calibration; None for a scene that ``prepare`` did not write.
+        The calibration; None if the scene was not written by ``prepare``.
 
     Raises:
         PolarguideError: the calibration is invalid.
@@ -217,7 +221,7 @@ Origin = Literal["mosaics", "stokes", "other"]
 
 
 def origin_of(path: Path, data: bytes) -> Origin:
-    """Return the kind of files of a prepared scene: mosaics of a sensor, Stokes vectors of a dataset, or others.
+    """Return the kind of files from which a scene was prepared, such as mosaics or Stokes vectors of a dataset.
 
     Args:
         path: path of ``scene.json`` for messages.
@@ -232,7 +236,7 @@ def origin_of(path: Path, data: bytes) -> Origin:
 
 
 ROUGH = 0.15
-"""GGX roughness of a rough surface. Its lobe is wider than some nine degrees to each side."""
+"""GGX roughness above which a surface counts as rough. Its reflection is then wider than nine degrees to each side."""
 LARGEST_ID = 65535
 MaterialClass = Literal["metal", "rough metal", "dielectric", "rough dielectric", "matte"]
 METAL_CLASSES: tuple[MaterialClass, ...] = ("metal", "rough metal")
@@ -243,7 +247,7 @@ _OBJECTS_REMEDY = "Correct it, or remove objid from the ground truth to score al
 
 
 class Material(msgspec.Struct, frozen=True):
-    """Material in ``scene.json``; other fields are ignored.
+    """Material of an object in ``scene.json``. Unknown fields are ignored.
 
     Attributes:
         type: name of the material, such as "plastic" or "roughconductor".
@@ -259,10 +263,11 @@ class Material(msgspec.Struct, frozen=True):
 
     @property
     def kind(self) -> MaterialClass | None:
-        """Class of the material for scores; None if the table is insufficient.
+        """Class of the material, by which scores are grouped. It is None if the fields do not determine it.
 
-        A metal has an extinction coefficient ``k`` or a metal type, a dielectric an index ``ior`` or a dielectric type.
-        Both are rough if ``alpha`` exceeds ``ROUGH``. Matte surfaces have no specular reflection.
+        A material is a metal if it has an extinction coefficient ``k``, or the type of a metal. It is a dielectric if
+        it has a refractive index ``ior``, or the type of a dielectric. Both are rough if ``alpha`` exceeds ``ROUGH``. A
+        matte material has no specular reflection.
         """
         rough = self.alpha is not None and self.alpha > ROUGH
         if self.type in METALS or self.k is not None:
@@ -273,12 +278,12 @@ class Material(msgspec.Struct, frozen=True):
 
 
 class SceneObject(msgspec.Struct, frozen=True):
-    """Object of a scene.
+    """Object of a scene according to ``scene.json``.
 
     Attributes:
-        id: number in ``objid`` of the ground truth, from 1; 0 means no object.
-        name: unique name.
-        foreground: True if the object belongs to the mask.
+        id: number of the object in the array ``objid`` of the ground truth. It is at least 1; 0 means no object.
+        name: name of the object, unique in the scene.
+        foreground: True if the foreground mask includes the object.
         material: material of the surface.
     """
 
@@ -289,20 +294,20 @@ class SceneObject(msgspec.Struct, frozen=True):
 
 
 class _ObjectTable(msgspec.Struct):
-    """Table of objects in ``scene.json``."""
+    """Field of ``scene.json`` with the list of objects."""
 
     objects: list[SceneObject] | None = None
 
 
 def objects_of(path: Path, data: bytes) -> tuple[SceneObject, ...]:
-    """Return the objects in ``scene.json``, which may have none.
+    """Return the objects that ``scene.json`` lists. The result may be empty.
 
     Args:
         path: path of ``scene.json`` for messages.
         data: its content.
 
     Raises:
-        PolarguideError: an object has no number or name, or shares it with another.
+        PolarguideError: an object has no number or name, or two objects have the same number or name.
     """
     objects = decode(data, _ObjectTable, path, remedy=_OBJECTS_REMEDY).objects or []
     for field in ("id", "name"):
@@ -329,15 +334,16 @@ _LARGEST_TRUTH = 1e18  # its square is finite in single precision
 
 @dataclass(frozen=True, eq=False)
 class GroundTruth:
-    """Ground truth of a view. Any field may be None.
+    """Ground truth of a view, with which a trained scene is compared. Any field may be None.
 
     Attributes:
-        normal: unit surface normals in the world, zero without a surface, [H, W, 3] float32.
-        depth: camera z in world units, 0 without a surface or if unknown, [H, W] float32.
+        normal: unit surface normals in the world, [H, W, 3] float32; zero at pixels without a surface.
+        depth: camera z in world units, [H, W] float32; 0 at pixels without a surface or with unknown depth.
         mask: foreground mask, [H, W] bool.
-        specular, diffuse: first-surface lobes as linear S0 in the exposure of the pictures, [H, W, 3] float32. Pictures
-            are S0 / 2, so rendered layers are compared with half of these.
-        object_ids: ``SceneObject.id`` of each pixel, 0 for none or several objects, [H, W] int32.
+        specular: specular reflection of the first surface as linear S0, [H, W, 3] float32. The scale is that of the
+            pictures, which show ``S0 / 2``. A rendered layer is therefore compared with half of this value.
+        diffuse: diffuse reflection of the first surface, in the same form as ``specular``.
+        object_ids: ``SceneObject.id`` at each pixel, [H, W] int32; 0 at pixels with no object or several objects.
     """
 
     normal: Tensor | None = None
@@ -349,15 +355,15 @@ class GroundTruth:
 
 
 def read_ground_truth(path: Path, data: bytes, *, size: tuple[int, int], factor: int) -> GroundTruth:
-    """Read a ground-truth file.
+    """Parse a ground-truth file, and average its arrays over pixel boxes.
 
     Args:
         path: path of the file for messages.
-        data: content of the ``.npz`` file with any of the arrays ``normal``, ``depth``, ``mask``, ``specular``,
-            ``diffuse`` and ``objid``; others are ignored.
+        data: content of the ``.npz`` file. It may have the arrays ``normal``, ``depth``, ``mask``, ``specular``,
+            ``diffuse`` and ``objid``. Other arrays are ignored.
         size: height and width of the stored pictures.
-        factor: side of the averaged boxes. Normals are averaged and normalized. A pixel is foreground, has a depth or
-            shows an object only if its whole box does.
+        factor: side of the boxes. Normals are averaged and normalized. A pixel of the result is foreground only if all
+            pixels of its box are foreground. The same rule applies to its depth and its object.
 
     Raises:
         PolarguideError: the file cannot be read, an array has another size, or values are not finite.
@@ -393,7 +399,7 @@ def read_ground_truth(path: Path, data: bytes, *, size: tuple[int, int], factor:
 
 
 def _check_truth(path: Path, name: str, array: NDArray[Any], size: tuple[int, int]) -> None:
-    """Refuse an array of another size or type, or with impossible values."""
+    """Check the size, the type and the values of an array of the ground truth."""
     shape = (*size, _CHANNELS[name]) if _CHANNELS[name] else size
     require(
         array.shape == shape and array.dtype.kind in "biuf",

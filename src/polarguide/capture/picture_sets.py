@@ -1,6 +1,7 @@
-"""Comparison of pictures of one view through a filter at known angles.
+"""Detect wrong pictures among the pictures of one view, which were taken through a filter at known angles.
 
-The other pictures of the view predict each picture. A large residual shows a wrong angle, another exposure or motion.
+Each picture is predicted from the other pictures of the view. A large residual is a sign of a wrong angle, a different
+exposure, or motion.
 """
 
 from __future__ import annotations
@@ -26,13 +27,14 @@ class SetLimits:
     """Constants of the comparison of pictures.
 
     Attributes:
-        marks: precision in degrees of the marks on a filter ring. Smaller differences are not errors.
-        against: largest residual of a picture that agrees with the others, over their median residual.
-        brighter: relative brightness above which a contradicting picture is called brighter or darker.
-        most_pixels: largest number of pixels of a set that are compared.
+        marks: precision of the marks on a filter ring, in degrees. A smaller difference of angles is no error.
+        against: largest ratio of a picture's residual to the median residual of the others at which it agrees with
+            them.
+        brighter: relative difference of brightness above which a message calls a wrong picture brighter or darker.
+        most_pixels: largest number of pixels that are compared.
         fewest_pixels: smallest number of pixels for a comparison.
-        determined: largest standard error in degrees of an angle that the light determines.
-        over_noise: smallest variation of the polarization over the picture, over its noise.
+        determined: largest standard error in degrees at which an estimated angle is reported.
+        over_noise: smallest ratio of the polarization's variation over the picture to its noise.
     """
 
     marks = 2.0
@@ -46,15 +48,16 @@ class SetLimits:
 
 @dataclass(frozen=True, eq=False)
 class SetSamples:
-    """Pictures of a set before the fit.
+    """Pictures of one view at K angles, from which Stokes vectors are fitted.
 
     Attributes:
-        labels: labels of the pictures, for messages.
-        values: linear uint16 codes or float32 intensities, [K, H, W, C]; C is 1 if all pictures are gray.
-        exposures: exposures of the pictures: angle in degrees, counter-clockwise as displayed, and gain.
-        lost: mask of saturated samples, [K, H, W].
-        dark: mask of pixels that are 0 in all pictures, [H, W]. masked: mask of excluded pixels, [H, W].
-        step: one stored value as a share of full scale.
+        labels: labels of the pictures for messages.
+        values: linear uint16 codes or float32 intensities, [K, H, W, C]. C is 1 if all pictures are gray, otherwise 3.
+        exposures: polarizer angle and gain of each picture.
+        lost: mask of the saturated pixels of each picture, [K, H, W].
+        dark: mask of the pixels that are 0 in all pictures, [H, W].
+        masked: mask of the pixels that are excluded from the fit, [H, W].
+        step: difference of two successive stored values, relative to full scale.
         notes: messages for the user.
     """
 
@@ -69,29 +72,36 @@ class SetSamples:
 
     @property
     def rows(self) -> NDArray[np.float32]:
-        """Malus's law as a matrix [K, 3]: the intensity of a picture is its row times the Stokes vector."""
+        """Malus's law as a matrix [K, 3]. Its product with a Stokes vector is the intensity in each of K pictures."""
         pairs = nominal(self.exposures).numpy()
         return np.asarray(np.concatenate((np.ones_like(pairs[:, :1]), pairs), axis=1) / 2, np.float32)
 
     @property
     def gains(self) -> NDArray[np.float32]:
-        """Divisor of the samples of each picture, [K]."""
+        """Number by which the values of each picture are divided, [K]."""
         return np.array([exposure.gain for exposure in self.exposures], np.float32)
 
     def intensities(self, at: Any) -> NDArray[np.float32]:
-        """Return linear intensities of some pixels divided by the gains, [K, ..., C]; ``at`` indexes [H, W]."""
+        """Return the linear intensities of some pixels divided by the gains, [K, ..., C].
+
+        Args:
+            at: index of the pixels in an array [H, W].
+        """
         chosen = self.values[(slice(None), *at)] if isinstance(at, tuple) else self.values[:, at]
         scale = np.float32(FULL_CODE) if self.values.dtype == np.uint16 else np.float32(1)
         gains = self.gains.reshape(-1, *[1] * (chosen.ndim - 1))
         return np.asarray(chosen.astype(np.float32) / (scale * gains))
 
     def gray(self, at: Any) -> NDArray[np.float32]:
-        """Return the luminance of ``intensities``, the mean of the colors, [K, ...]."""
+        """Return the mean of ``intensities`` over the color channels, [K, ...]."""
         return mean_color(self.intensities(at))
 
 
 def mean_color(colors: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return the mean of one or three colors [..., C] as a contiguous array [...]. NumPy's mean of three is slow."""
+    """Return the mean of one or three color channels [..., C] as a contiguous array [...].
+
+    This is faster than NumPy's mean over an axis of length 3.
+    """
     if colors.shape[-1] == 1:
         return np.ascontiguousarray(colors[..., 0])
     return np.asarray((colors[..., 0] + colors[..., 1] + colors[..., 2]) / np.float32(3))
@@ -99,16 +109,17 @@ def mean_color(colors: NDArray[np.float32]) -> NDArray[np.float32]:
 
 @dataclass(frozen=True)
 class PictureFit:
-    """Comparison of one picture of a set with the prediction of the others.
+    """Comparison of one picture of a view with its prediction from the other pictures.
 
     Attributes:
-        label: its file, and frame of a video.
-        angle: angle of the fit in degrees, including sense, zero and orientation.
-        gain: divisor of the samples.
-        looks_like: angle with the best prediction, degrees; None if the light does not determine it.
-        error: standard error of ``looks_like``, degrees, or None.
-        residual: root mean square of the residuals, in full scales.
-        left_out: True if the picture is excluded from the fit.
+        label: name of the file; for a video also the number of the frame.
+        angle: stated polarizer angle as displayed, in degrees.
+        gain: number by which the values of the picture are divided.
+        looks_like: angle in degrees at which the prediction matches the picture best. It is None if the light does not
+            determine the angle.
+        error: standard error of ``looks_like`` in degrees, or None.
+        residual: root mean square of the residuals, relative to full scale.
+        left_out: True if the picture is excluded from the fit of Stokes vectors.
     """
 
     label: str
@@ -122,11 +133,11 @@ class PictureFit:
 
 @dataclass(frozen=True)
 class SetJudgment:
-    """Comparison of the pictures of a set with each other.
+    """Result of the comparison of K pictures of a view.
 
     Attributes:
-        pictures: the comparison of each picture with the others.
-        used: [K] bool, the pictures that agree and are fitted.
+        pictures: result for each picture.
+        used: mask of the pictures that agree with each other, [K] bool. Stokes vectors are fitted to these pictures.
         notes: messages for the user.
     """
 
@@ -137,11 +148,11 @@ class SetJudgment:
 
 @dataclass(frozen=True)
 class _Prediction(AngleEstimate):
-    """Comparison of a picture with the Stokes vectors of the others.
+    """Comparison of a picture with its prediction from the Stokes vectors of the other pictures.
 
     Attributes:
-        gain: brightness over the predicted one.
-        residual: root mean square of the differences.
+        gain: ratio of the picture's brightness to the predicted brightness.
+        residual: root mean square of the differences from the prediction.
     """
 
     floor: float = SetLimits.marks
@@ -150,7 +161,10 @@ class _Prediction(AngleEstimate):
 
 
 def chosen_pixels(samples: SetSamples) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Return rows and columns of pixels that are usable in every picture, spread over the picture."""
+    """Return the row indices and the column indices of pixels that are usable in every picture.
+
+    If there are more pixels than ``SetLimits.most_pixels``, return an evenly spread subset.
+    """
     good = ~(samples.dark | samples.masked)
     for lost in samples.lost:
         good &= ~lost
@@ -160,13 +174,14 @@ def chosen_pixels(samples: SetSamples) -> tuple[NDArray[Any], NDArray[Any]]:
 
 
 def judge(samples: SetSamples, gray: Floats) -> SetJudgment:
-    """Compare the pictures of a set with each other, and choose the pictures for the fit.
+    """Compare the pictures of a view with each other, and choose the pictures for the fit of Stokes vectors.
 
-    Each picture is fitted with Malus's law at an unknown angle and gain to the Stokes vectors of the others, over all
-    pixels at once. The picture with the largest deviation is excluded, as long as enough others agree without it.
+    The other pictures give a Stokes vector at each pixel. Malus's law predicts the picture from these vectors, with one
+    unknown angle and one unknown gain for all pixels. The picture with the largest deviation is excluded. This is
+    repeated as long as enough pictures agree without it.
 
     Args:
-        samples: the set.
+        samples: pictures of the view.
         gray: luminance [K, N] at pixels that are usable in every picture.
     """
     count = len(samples.labels)
@@ -174,7 +189,7 @@ def judge(samples: SetSamples, gray: Floats) -> SetJudgment:
     reasons: dict[int, str] = {}
     while gray.shape[1] >= SetLimits.fewest_pixels:
         predicted = _predictions(samples, gray, used, used)
-        # Candidates: the picture with the largest residual, and the one with the largest error of its angle.
+        # The candidates are the pictures with the largest residual and with the largest error of the angle.
         candidates = (
             max(predicted, key=lambda k: predicted[k].residual),
             max(predicted, key=lambda k: abs(predicted[k].off)),
@@ -208,7 +223,10 @@ def judge(samples: SetSamples, gray: Floats) -> SetJudgment:
 
 
 def _contradicts(samples: SetSamples, gray: Floats, used: Mask, worst: int, predicted: _Prediction) -> bool:
-    """Return True if angle or residual of a picture deviates far more than those of the other pictures."""
+    """Return True if a picture contradicts the others.
+
+    This is the case if its angle or its residual deviates far more than the angles or residuals of the other pictures.
+    """
     rows = samples.rows.astype(np.float64)
     rest = used.copy()
     rest[worst] = False
@@ -222,7 +240,7 @@ def _contradicts(samples: SetSamples, gray: Floats, used: Mask, worst: int, pred
 
 
 def _reason(samples: SetSamples, k: int, predicted: _Prediction) -> str:
-    """Return the reason why a picture is rejected, for the user."""
+    """Describe for the user why a picture is rejected."""
     change = predicted.gain - 1
     if predicted.angle is not None and abs(predicted.off) > SetLimits.marks:
         reason = f"looks like {predicted.angle:.0f} degrees: its angle is probably wrong"
@@ -235,7 +253,10 @@ def _reason(samples: SetSamples, k: int, predicted: _Prediction) -> str:
 
 
 def _predictions(samples: SetSamples, gray: Floats, used: Mask, chosen: Mask) -> dict[int, _Prediction]:
-    """Compare each picture in ``chosen`` with the other pictures in ``used``, by index."""
+    """Predict each picture in ``chosen`` from the other pictures in ``used``.
+
+    The keys of the result are indices of pictures.
+    """
     rows = samples.rows.astype(np.float64)
     predicted = {}
     for k in np.flatnonzero(chosen).tolist():
@@ -246,11 +267,12 @@ def _predictions(samples: SetSamples, gray: Floats, used: Mask, chosen: Mask) ->
 
 
 def _predict(rows: Floats, gray: Floats, others: Mask, k: int, stated: float) -> _Prediction:
-    """Predict one picture from the others, by least squares over angle and gain.
+    """Predict picture ``k`` from the pictures ``others``, and fit its angle and gain by least squares.
 
-    With m = (1, cos 2t, sin 2t) / 2 times the Stokes vector, the angle t has the least sum of (I - g m)^2. The
-    contribution of noise is subtracted from the moments of the Stokes vectors. Otherwise, unpolarized light would seem
-    to determine an angle.
+    A polarizer at the angle t transmits ``m = (1, cos 2t, sin 2t) / 2`` times the Stokes vector. The fit minimizes the
+    sum of ``(I - g m)^2`` over all pixels, where I is the intensity of the picture and g its gain. The contribution of
+    noise is subtracted from the second moments of the Stokes vectors. Otherwise, unpolarized light would seem to
+    determine an angle.
     """
     if not gray.shape[1]:  # a picture is saturated at every pixel
         return _Prediction(None, math.inf, stated)
@@ -262,7 +284,7 @@ def _predict(rows: Floats, gray: Floats, others: Mask, k: int, stated: float) ->
     freedom = int(others.sum()) - 3
     leverage = float(((rows[k] @ inverse) ** 2).sum())
     residual = math.sqrt(float(np.mean((picture - rows[k] @ stokes) ** 2)) / (1 + leverage))
-    # A robust estimate, so that a few moving pixels do not matter. Without redundancy, the residual of this picture.
+    # The estimate is robust to a few moving pixels. Without redundancy, the residual of this picture is used.
     noise = residual**2 if freedom < 1 else typical_variance((residuals**2).sum(axis=0), freedom)
     extra = noise * inverse @ inverse.T / 4
     moments = stokes @ stokes.T / (4 * pixels) - extra
@@ -285,5 +307,8 @@ def _predict(rows: Floats, gray: Floats, others: Mask, k: int, stated: float) ->
 
 
 def typical_variance(squares: Floats, freedom: int) -> float:
-    """Return a robust variance, from the median of sums of ``freedom`` squares each."""
+    """Return a robust estimate of the variance from the median of ``squares``.
+
+    Each element of ``squares`` is a sum of ``freedom`` squared residuals.
+    """
     return float(np.median(squares)) / float(2 * gammaincinv(freedom / 2, 0.5))

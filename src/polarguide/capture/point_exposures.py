@@ -1,4 +1,4 @@
-"""Exposures of pictures from the brightness of shared points, with standard errors."""
+"""Estimate the relative exposures of views from the brightness of 3D points that several views observe."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from polarguide.capture.formats.pictures import linear_codes
 
 Array = NDArray[np.floating[Any]]
 FEWEST = 20
-"""Smallest number of points that determines the exposure of a picture."""
+"""Smallest number of points from which the exposure of a picture is estimated."""
 MOST_POINTS = 20_000
-"""Largest number of points that are compared. Points with the longest tracks are preferred."""
+"""Largest number of points that are compared. Points that many views observe are preferred."""
 _LEAST_TRACK = 3
 _ROUNDS = 40
 _SETTLED = 1e-4
@@ -38,14 +38,16 @@ _FULL = 65535.0
 
 @dataclass(frozen=True, eq=False)
 class PointExposures:
-    """Exposures of pictures.
+    """Estimated relative exposures of V pictures with C color channels.
 
     Attributes:
-        logs: logarithms [V, C] of C channels, with mean 0. NaN for pictures with fewer than ``FEWEST`` points, or
-            outside the largest set of pictures that points connect.
-        errors: standard errors of the means over the channels, [V]; infinite if unknown.
-        color_errors: standard errors of the deviations of the channels from these means, [V].
-        points: number of points of each picture, [V].
+        logs: natural logarithms of the exposures, [V, C], with mean 0. They are NaN for a picture with fewer than
+            ``FEWEST`` points, and for a picture that shares too few points with the other pictures.
+        errors: standard error of the brightness of each picture, which is the mean of ``logs`` over the channels, [V].
+            It is infinite if it is unknown.
+        color_errors: standard error of the color of each picture, which is the deviation of ``logs`` from the
+            brightness, [V].
+        points: number of points in each picture, [V].
     """
 
     logs: Array
@@ -55,11 +57,11 @@ class PointExposures:
 
     @property
     def significant(self) -> Array:
-        """Significant logarithms [V, C]; NaN for unknown exposures.
+        """Significant part of ``logs``, [V, C]. It is NaN for unknown exposures.
 
-        Brightness and color are tested separately. A value is 0 in all pictures unless one of them differs from the
-        mean with a false-alarm probability of 1 % over all pictures. Then it is 0 only in pictures within two standard
-        errors of the mean.
+        Brightness and color are tested separately. If no picture differs significantly from the mean, all values are 0.
+        The probability of a false alarm in this test is 1 % for all pictures together. If a picture differs, only the
+        pictures within two standard errors of the mean have the value 0.
         """
         bright = self.logs.mean(axis=1)
         color = self.logs - bright[:, None]
@@ -69,17 +71,17 @@ class PointExposures:
         return np.where(np.isfinite(self.logs), common + tint, np.nan)
 
     def gains(self) -> list[tuple[float, float, float]]:
-        """Return the significant gains of R, G and B of each picture; 1 for unknown exposures."""
+        """Return the gains of R, G and B for each picture. A gain is 1 if it is unknown or not significant."""
         return [
             (float(r), float(g), float(b)) for r, g, b in np.exp(np.nan_to_num(self.significant)).round(6)
         ]
 
 
 def significant(sizes: Array, errors: Array) -> NDArray[np.bool_]:
-    """Return a mask of the significant differences, [V], as described in ``PointExposures.significant``.
+    """Return a mask of the pictures that differ significantly, [V], as ``PointExposures.significant`` describes.
 
     Args:
-        sizes: absolute differences, [V].
+        sizes: absolute difference of each picture from the mean, [V].
         errors: standard errors of the differences, [V].
     """
     known = np.isfinite(sizes)
@@ -90,14 +92,15 @@ def significant(sizes: Array, errors: Array) -> NDArray[np.bool_]:
 
 
 def exposures_of_points(values: Array, places: Array) -> PointExposures:
-    """Estimate exposures of pictures from intensities of points.
+    """Estimate the exposures of pictures from the intensities of points.
 
     The model is ``log(value) = exposure of the picture + brightness of the point``. The sum of absolute residuals is
     minimized by iteratively reweighted least squares. Points with scattered residuals get small weights, because
     reflections and polarization change their brightness between pictures.
 
-    Parts of space are also solved separately. The error of an exposure is the standard deviation over these parts. It
-    does not decrease with their number, because the reflections in all parts come from the same light.
+    For the standard errors, space is divided into parts, and the exposures are estimated from the points of each part
+    alone. The error is the standard deviation over the parts. It is not divided by the root of their number, because
+    reflections of the same light disturb all parts in the same way.
 
     Args:
         values: positive linear intensities [points, pictures, channels]; NaN for missing measurements.
@@ -128,7 +131,7 @@ def exposures_of_points(values: Array, places: Array) -> PointExposures:
 
 
 def _connected(valid: NDArray[np.bool_], fewest: int) -> NDArray[np.int64]:
-    """Return the indices of the largest set of pictures that shared points connect."""
+    """Return the indices of the largest set of pictures that are connected by at least ``fewest`` shared points."""
     enough = np.flatnonzero(valid.sum(axis=0) >= fewest)
     if len(enough) == 0:
         return enough
@@ -138,7 +141,7 @@ def _connected(valid: NDArray[np.bool_], fewest: int) -> NDArray[np.int64]:
 
 
 def _solve(values: Array) -> Array:
-    """Return the logarithms of the exposures of connected pictures, [V, C], with mean 0."""
+    """Estimate the logarithms of the exposures, [V, C], with mean 0. Shared points must connect all pictures."""
     valid = np.all(np.isfinite(values), axis=-1)
     paired = valid.sum(axis=1) >= 2
     point, picture = np.nonzero(valid[paired])
@@ -150,7 +153,14 @@ def _solve(values: Array) -> Array:
 def _solve_channel(
     log: Array, point: NDArray[np.int64], picture: NDArray[np.int64], size: tuple[int, int]
 ) -> Array:
-    """Solve for the exposures of one channel from logarithms of intensities at pairs of point and picture."""
+    """Estimate the logarithms of the exposures of one channel.
+
+    Args:
+        log: logarithms of the intensities, one for each observation of a point in a picture.
+        point: index of the point of each observation.
+        picture: index of the picture of each observation.
+        size: numbers of points and pictures.
+    """
     rows, columns = size
     tracks = np.bincount(point, minlength=rows)
     weights = np.ones(len(log))
@@ -177,7 +187,7 @@ def _solve_channel(
 
 
 def _parts(places: Array, divisions: int) -> NDArray[np.int64]:
-    """Return the part index of each point, [M], by repeated bisection along the longest side."""
+    """Divide points into parts by repeated bisection along the longest side, and return their part indices, [M]."""
     parts = np.zeros(len(places), np.int64)
     for _ in range(divisions):
         halved = 2 * parts
@@ -190,7 +200,10 @@ def _parts(places: Array, divisions: int) -> NDArray[np.int64]:
 
 
 def _errors(values: Array, parts: NDArray[np.int64], logs: Array) -> Array:
-    """Return standard deviations of brightness and color over parts of space, weighted by their points, [2, V]."""
+    """Return the standard deviations of brightness and color over the parts of space, [2, V].
+
+    A part is weighted by its number of points.
+    """
     squares = np.zeros((2, len(logs)))
     total = np.zeros(len(logs))
     used = np.zeros(len(logs), np.int64)
@@ -217,11 +230,12 @@ def _errors(values: Array, parts: NDArray[np.int64], logs: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class PointSamples:
-    """Intensities of pictures around the projections of points.
+    """Intensities of the K pictures of a view at the projections of N points.
 
     Attributes:
-        values: linear means over 3 x 3 pixels, [N, K, 3]; NaN outside the picture and next to bad pixels.
-        peaks: largest stored values of these pixels, [N].
+        values: mean linear intensities of the 3 x 3 pixels around each projection, [N, K, 3]. They are NaN outside the
+            picture and next to unusable pixels.
+        peaks: largest stored value of these pixels for each point, [N].
     """
 
     values: Array
@@ -229,9 +243,12 @@ class PointSamples:
 
 
 def matte(values: Array) -> Array:
-    """Return half of the unpolarized light, (S0 - |(S1, S2)|) / 2, of four angles [N, 4, C]; NaN for little light.
+    """Return half of the unpolarized light, ``(S0 - |(S1, S2)|) / 2``, [N, C]. It is NaN if there is little light.
 
-    Unpolarized light contains fewer reflections.
+    It is used for the comparison of exposures because it contains fewer reflections.
+
+    Args:
+        values: intensities at 0, 45, 90 and 135 degrees, [N, 4, C].
     """
     first = values[:, 0] - values[:, 2], values[:, 1] - values[:, 3]
     least = values.mean(axis=1) - np.hypot(*first) / 2
@@ -240,11 +257,13 @@ def matte(values: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class ComparedPoints:
-    """Points of a model by which the exposures of its views are compared.
+    """3D points of a COLMAP model at which the exposures of its views are compared.
 
     Attributes:
-        model: the model. places: positions, [N, 3]. columns: index of each view by name.
+        model: the COLMAP model.
+        places: positions of the points, [N, 3].
         observed: mask of the points that each view observes, [N, V].
+        columns: column of each view in ``observed`` by name.
     """
 
     model: ColmapModel
@@ -254,7 +273,7 @@ class ComparedPoints:
 
     @classmethod
     def of(cls, model: ColmapModel, views: Sequence[str]) -> ComparedPoints | None:
-        """Select the points with the longest tracks; None if the model stores no tracks."""
+        """Select the points that most views observe. Return None if the model does not store the observations."""
         observed = model.observations(views).numpy()
         longest = np.argsort(-observed.sum(axis=1), kind="stable")[:MOST_POINTS]
         observed = observed[longest]
@@ -270,11 +289,16 @@ class ComparedPoints:
     def samples(
         self, view: str, raw: Sequence[NDArray[Any]], bad: NDArray[np.bool_] | None, transfer: str
     ) -> PointSamples | None:
-        """Sample the stored pictures of a view at the points that it observes; None without a pose.
+        """Sample the stored pictures of a view at the points that it observes.
 
         Args:
-            view: name of the view. raw: K stored pictures, [H, W, 3].
-            bad: mask of unusable pixels, [H, W]. transfer: encoding of the pictures.
+            view: name of the view.
+            raw: K stored pictures, [H, W, 3] each.
+            bad: mask of unusable pixels, [H, W].
+            transfer: encoding of the pictures.
+
+        Returns:
+            The samples, or None if the view has no pose.
         """
         if view not in self.columns:
             return None
@@ -300,10 +324,14 @@ class ComparedPoints:
         return PointSamples(values, peaks)
 
     def exposures(self, samples: Mapping[str, PointSamples | None], full_scale: int | None) -> PointExposures:
-        """Estimate the exposures of views of four angles, in their order.
+        """Estimate the exposures of views with pictures at 0, 45, 90 and 135 degrees.
 
         Args:
-            samples: samples by view; None without a pose. full_scale: stored value of saturated pixels, or None.
+            samples: samples of each view; None for a view without a pose.
+            full_scale: stored value at which pixels are saturated; None if no pixel is saturated.
+
+        Returns:
+            The exposures in the order of ``samples``.
         """
         values = np.full((len(self.places), len(samples), 3), np.nan, np.float32)
         for place, (view, sampled) in enumerate(samples.items()):

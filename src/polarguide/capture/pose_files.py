@@ -1,7 +1,8 @@
-"""Cameras of pose files: ``transforms.json`` (nerfstudio, instant-ngp, Blender), XML of Metashape, ``.npz`` of IDR.
+"""Read cameras from pose files of other programs.
 
-docs/reference/formats.md describes each field. A field that changes the meaning of numbers is used or refused. An
-unknown field causes a warning.
+The files are ``transforms.json`` (nerfstudio, instant-ngp, Blender), XML files of Metashape, and ``.npz`` files of IDR.
+docs/reference/formats.md describes their fields. A field that would change the meaning of other fields and is not
+supported causes an error. An unknown field causes a warning.
 """
 
 from __future__ import annotations
@@ -36,16 +37,17 @@ from polarguide.core.text import listed, number_or_nan
 
 Size = tuple[int, int]
 Sizes = Callable[[str], tuple[Size, ...]]
-"""Function that lists the possible sizes (width, height) of a view's camera, the likeliest first."""
+"""Function that returns the possible sizes (width, height) of a view's camera. The most likely size is first."""
 _OFF_CENTER = 0.125
-"""Largest offset of a principal point from the center, as a share of the side.
+"""Largest distance of a principal point from the center of the picture, as a share of the picture's side.
 
-Lenses are off by some percent. A principal point of pictures of half the size is off by a quarter.
+The principal point of a lens is off by a few percent. If it refers to pictures of half the size, it is off by a
+quarter.
 """
 
 
 def is_centered(size: Size, center: tuple[float | None, float | None]) -> bool:
-    """Return True if the known coordinates of a principal point are near the center of the picture."""
+    """Return True if a principal point is near the center of the picture. Coordinates that are None are ignored."""
     return all(
         place is None or abs(place - side / 2) <= _OFF_CENTER * side
         for place, side in zip(center, size, strict=True)
@@ -55,16 +57,18 @@ def is_centered(size: Size, center: tuple[float | None, float | None]) -> bool:
 def settled_size(
     where: object, sizes: Sequence[Size], center: tuple[float | None, float | None], *, in_pixels: bool
 ) -> Size:
-    """Return the size whose center is near the principal point.
+    """Choose the picture size of a camera whose file does not state it.
+
+    The principal point must be near the center of the picture.
 
     Args:
-        where: place for messages.
-        sizes: possible sizes, the likeliest first.
-        center: principal point, None for an unknown coordinate.
-        in_pixels: if True, other numbers of the camera are in pixels and depend on the size.
+        where: file and camera that an error message names.
+        sizes: possible sizes. The most likely size is first.
+        center: principal point. A coordinate is None if it is unknown.
+        in_pixels: if True, other numbers of the camera are in pixels, so they depend on the size.
 
     Raises:
-        PolarguideError: no size is known, no size fits the principal point, or several do.
+        PolarguideError: there is no possible size, or the principal point fits no size or several sizes.
     """
     expected = "width and height of the pictures that the camera was made for, w and h"
     require_camera(sizes, where, expected, "none")
@@ -79,13 +83,16 @@ def settled_size(
 
 
 _OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
-"""Change of axes for cameras that look along -z with y up."""
+"""Matrix that converts a pose with OpenGL's camera axes (y up, view along -z) to axes right, down, forward."""
 _PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 _FISHEYE = "OPENCV_FISHEYE"
 MOST_FRAMES = 20_000
-"""Largest number of frames of a file."""
+"""Largest number of frames in a file that is accepted."""
 _SAME_FOCAL = 0.01
-"""Relative difference of equal focal lengths. Rounding causes less, resized pictures far more."""
+"""Largest relative difference of two focal lengths that count as equal.
+
+Rounding causes smaller differences, resized pictures much larger differences.
+"""
 
 
 _NUMBERS = (
@@ -100,7 +107,7 @@ _LENS: dict[str, Any] = {
     "is_fisheye": bool | None,
     "intrinsic_matrix": list[list[float]] | None,
 }
-"""Types of the fields of a lens, for all frames or for one."""
+"""Type of each field of a lens. The fields may apply to the whole file or to one frame."""
 _Lens: Any = msgspec.defstruct("_Lens", [(name, kind, None) for name, kind in _LENS.items()])
 
 
@@ -119,7 +126,7 @@ class _Transforms(_Lens):
     from_na: bool | None = None
 
 
-# Fields without influence on a camera: placement of the scene, training, depth, masks and points.
+# Known fields that do not affect cameras: placement of the scene, training, depth, masks and points.
 _IRRELEVANT = {
     "aabb", "aabb_scale", "render_aabb", "scale", "offset", "up", "applied_transform", "applied_scale",
     "orientation_override", "auto_scale_poses_override", "centered", "ply_file_path", "n_frames",
@@ -134,7 +141,7 @@ _IRRELEVANT = {
 
 
 def read_transforms(path: Path, views: Collection[str], sizes: Sizes) -> dict[str, PosedCamera]:
-    """Read the cameras of a ``transforms.json`` by the views of the frames' file names.
+    """Read the cameras of a file ``transforms.json``. The file name of a frame determines its view.
 
     Args:
         path: path of the file.
@@ -183,9 +190,10 @@ _COEFFICIENTS = ("k1", "k2", "k3", "k4", "p1", "p2")
 
 
 def _lens_of(where: str, frame: Any, record: Any) -> dict[str, Any]:
-    """Collect the fields of a frame's lens, with defaults from the file; ``intrinsic_matrix`` becomes four numbers.
+    """Collect the fields of a frame's lens. Fields of the whole file are defaults.
 
-    A frame that has one field of the focal length uses no such field of the file. The same holds for coefficients.
+    If a frame has a field for the focal length, all fields of the file for the focal length are ignored. The same rule
+    applies to distortion coefficients. ``intrinsic_matrix`` is converted to focal lengths and principal point.
 
     Raises:
         PolarguideError: ``intrinsic_matrix`` is invalid, or other fields specify the intrinsics again.
@@ -245,10 +253,10 @@ def _camera_of(
 
 
 def _is_fisheye(where: str, lens: Mapping[str, Any]) -> bool:
-    """Return True for a fisheye lens of OpenCV, and False for a perspective lens.
+    """Return True if the lens is a fisheye lens of OpenCV, and False if it is a perspective lens.
 
     Raises:
-        PolarguideError: the lens is unsupported, such as a panorama, or fields contradict one another.
+        PolarguideError: the lens is of another kind, such as a panorama, or two fields contradict each other.
     """
     model = lens["camera_model"]
     expected = f"a camera of {', '.join(_PERSPECTIVE)} or {_FISHEYE}"
@@ -271,10 +279,10 @@ def _is_fisheye(where: str, lens: Mapping[str, Any]) -> bool:
 
 
 def _distortion(where: str, lens: Mapping[str, Any], fisheye: bool) -> list[float]:
-    """Return k1, k2, p1, p2 and k3 of a perspective camera, or k1 to k4 of a fisheye.
+    """Return the distortion coefficients: k1, k2, p1, p2 and k3 of a perspective camera, or k1 to k4 of a fisheye.
 
     Raises:
-        PolarguideError: the lens has other coefficients, or two fields differ.
+        PolarguideError: the lens has other coefficients, or two fields for a coefficient differ.
     """
     coefficients = [lens[name] for name in _COEFFICIENTS]
     value = [float(number or 0.0) for number in coefficients]
@@ -304,10 +312,10 @@ def _distortion(where: str, lens: Mapping[str, Any], fisheye: bool) -> list[floa
 
 
 def _stated_size(where: str, lens: Mapping[str, Any]) -> tuple[int, int] | None:
-    """Return width and height of the file; None if it has no size.
+    """Return the width and height that a file states. Return None if it states no size.
 
     Raises:
-        PolarguideError: the file has only one of the two, or an invalid size.
+        PolarguideError: the file states only width or only height, or the size is invalid.
     """
     width = lens["w"]
     height = lens["h"]
@@ -325,10 +333,12 @@ def _stated_size(where: str, lens: Mapping[str, Any]) -> tuple[int, int] | None:
 def _focal_lengths(
     where: str, lens: Mapping[str, Any], size: tuple[int, int], fisheye: bool
 ) -> tuple[float, float]:
-    """Return the focal lengths in x and y from lengths in pixels or angles of view in radians or degrees.
+    """Return the focal lengths in x and y in pixels.
+
+    The file may state focal lengths in pixels, or angles of view in radians or degrees.
 
     Raises:
-        PolarguideError: a value is not positive, all are missing, or two values differ.
+        PolarguideError: a value is not positive, all values are missing, or two values contradict each other.
     """
     lengths: list[float | None] = []
     for axis, side in zip("xy", size, strict=True):
@@ -358,7 +368,7 @@ def _focal_lengths(
 
 
 def brown_camera(inner: Sequence[float], coefficients: Sequence[float]) -> tuple[str, tuple[float, ...]]:
-    """Return COLMAP's model and parameters of a perspective camera.
+    """Return the name and the parameters of COLMAP's camera model for a perspective camera.
 
     Args:
         inner: focal lengths and principal point.
@@ -375,10 +385,11 @@ def camera_to_world(
     """Create a camera from its pose in the world.
 
     Args:
-        where: place for messages.
+        where: file and camera that an error message names.
         size: width and height.
-        lens: COLMAP's model and its parameters; pixel centers are at 0.5.
-        to_world: matrix with axes right, down, forward, [4, 4]; its scale is removed.
+        lens: name of COLMAP's camera model, and its parameters. The center of the first pixel is at (0.5, 0.5).
+        to_world: matrix from the camera to the world for camera axes right, down, forward, [4, 4]. Its scale is
+            removed.
 
     Raises:
         PolarguideError: the matrix is not a pose.
@@ -393,13 +404,14 @@ def camera_to_world(
 SUFFIXES = (".json", ".xml", ".npz")
 """Suffixes of pose files."""
 TEST = "test"
-"""Name of the test part of a dataset."""
+"""Name of the part of a dataset that is held out."""
 
 
 def parts_of_poses(folder: Path) -> dict[str, Path]:
-    """Find the pose files of a folder by part: ``transforms.json``, or ``transforms_train.json`` and its neighbors.
+    """Find the pose files of a folder, and return them by part of the dataset.
 
-    NeRF's synthetic scenes have a file for each of the parts train, val and test.
+    A folder has one file ``transforms.json``, or a file for each part, as in the synthetic scenes of NeRF:
+    ``transforms_train.json``, ``transforms_val.json`` and ``transforms_test.json``.
     """
     single = folder / "transforms.json"
     if single.is_file():
@@ -411,10 +423,13 @@ def parts_of_poses(folder: Path) -> dict[str, Path]:
 def read_parts(
     parts: Mapping[str, Path], views: Sequence[str], sizes: Sizes
 ) -> tuple[dict[str, PosedCamera], tuple[str, ...]]:
-    """Read cameras by view name from several files, and the views of the test part.
+    """Read the cameras of several pose files.
+
+    Returns:
+        The cameras by view name, and the names of the views in the part "test".
 
     Raises:
-        PolarguideError: ``read_pose_file`` rejects a file, or two files have a camera of one view.
+        PolarguideError: a file is invalid (see ``read_pose_file``), or two files have a camera for the same view.
     """
     cameras: dict[str, PosedCamera] = {}
     tests: tuple[str, ...] = ()
@@ -434,7 +449,7 @@ def read_parts(
 
 
 def read_pose_file(path: Path, views: Sequence[str], sizes: Sizes) -> dict[str, PosedCamera]:
-    """Read cameras by view name.
+    """Read the cameras of a pose file by view name.
 
     Args:
         path: ``.json`` of nerfstudio, instant-ngp or Blender, ``.xml`` of Metashape, or ``.npz`` with ``world_mat_<i>``
@@ -443,7 +458,7 @@ def read_pose_file(path: Path, views: Sequence[str], sizes: Sizes) -> dict[str, 
         sizes: possible sizes of a view's camera for files without a size.
 
     Raises:
-        PolarguideError: the file cannot be read, or has no camera of these views.
+        PolarguideError: the file cannot be read, or has no camera for any of the views.
     """
     suffix = path.suffix.lower()
     if suffix == ".npz":
@@ -461,7 +476,9 @@ def read_pose_file(path: Path, views: Sequence[str], sizes: Sizes) -> dict[str, 
 
 
 def _idr(path: Path, views: Sequence[str], sizes: Sizes) -> dict[str, PosedCamera]:
-    """Read the cameras of IDR and match them with views by number, or by order if the counts are equal.
+    """Read the cameras of a file of IDR, and match them with views.
+
+    If there are as many cameras as views, they are matched in their order. Otherwise, they are matched by number.
 
     Raises:
         PolarguideError: the match is ambiguous.
@@ -496,16 +513,19 @@ def _idr(path: Path, views: Sequence[str], sizes: Sizes) -> dict[str, PosedCamer
 _LARGEST_XML = 1 << 24
 _METASHAPE_LENS = ("f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4")
 _LARGEST_SKEW = 0.25
-"""Largest shift in pixels by skew at the edge of a picture. Conventions of pixel centers differ by more."""
+"""Largest shift in pixels at the edge of a picture that an ignored skew may cause.
+
+The conventions for pixel centers differ by half a pixel, which is more.
+"""
 _EQUIDISTANT = ("fisheye", "equidistant_fisheye")
-"""Types of equidistant fisheye lenses before and since version 2.3."""
+"""Names of an equidistant fisheye lens in Metashape before version 2.3, and since this version."""
 _OFF = ("", "0", "false", "none", "disabled")
 _METASHAPE_FIELDS = {
     "sensor": {"resolution", "calibration", "rolling_shutter"},
     "calibration": {"resolution", *_METASHAPE_LENS},
     "camera": {"transform", "rolling_shutter"},
 }
-# Fields without influence on a camera: bands, exposures, accuracies, GPS, and the placement of the chunk in the world.
+# Known elements that do not affect cameras: bands, exposures, accuracies, GPS, and the placement of the chunk.
 # ``orientation`` is for display only; pose and calibration refer to the stored pixels.
 _METASHAPE_IRRELEVANT = {
     "sensor": {
@@ -523,7 +543,7 @@ _METASHAPE_IRRELEVANT = {
 
 
 def read_metashape(path: Path, views: Collection[str]) -> dict[str, PosedCamera]:
-    """Read Metashape's cameras by the views of their labels.
+    """Read the cameras of an XML file of Metashape. The label of a camera determines its view.
 
     Args:
         path: path of the file.
@@ -567,7 +587,7 @@ def _warn(path: Path, text: str) -> None:
 
 
 def _chunk(path: Path, root: ElementTree.Element) -> ElementTree.Element:
-    """Return the only chunk whose cameras have poses. Each chunk has a coordinate frame of its own.
+    """Return the chunk whose cameras have poses. There must be one only, because each chunk has its own world axes.
 
     Raises:
         PolarguideError: several chunks have poses.
@@ -633,10 +653,13 @@ def _require_known(path: Path, camera: ElementTree.Element, sensor: ElementTree.
 
 
 def _metashape_lens(where: str, sensor: Any) -> tuple[tuple[int, int], tuple[str, tuple[float, ...]]]:
-    """Return a sensor's size, and COLMAP's model and parameters of its lens. An adjusted calibration takes precedence.
+    """Convert a sensor of Metashape to a camera model of COLMAP. An adjusted calibration takes precedence.
 
-    Metashape's p1 and p2 are OpenCV's and COLMAP's p2 and p1. Its fisheye applies the same polynomial to the angle from
-    the axis that a frame camera applies to the tangent.
+    The coefficients p1 and p2 of Metashape are p2 and p1 of OpenCV and COLMAP. The polynomial of a frame camera is a
+    function of the tangent of the angle from the axis. That of a fisheye is a function of the angle itself.
+
+    Returns:
+        The width and height; and the name and the parameters of COLMAP's camera model.
 
     Raises:
         PolarguideError: the type of the lens is unsupported, or COLMAP's model lacks one of its terms.
@@ -676,7 +699,7 @@ def _metashape_lens(where: str, sensor: Any) -> tuple[tuple[int, int], tuple[str
 
 
 def _require_terms(where: str, value: Mapping[str, float], height: float, others: Sequence[str]) -> None:
-    """Refuse a lens with terms that its model lacks: ``others``, and a skew that moves pixels.
+    """Refuse a lens with a term that COLMAP's model lacks, such as a coefficient in ``others`` or a large skew.
 
     Raises:
         PolarguideError: the lens has such a term.

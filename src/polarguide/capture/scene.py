@@ -58,24 +58,29 @@ from polarguide.geometry.camera import Camera
 from polarguide.optics import Mount
 
 TEST_EVERY = 8
-"""Number of views per held-out view."""
+"""Number of views for which one view is held out: one view in eight."""
 FAR = 2.5
-"""Distance of a held-out view from its nearest training view, relative to the usual distance, above which it is far."""
+"""Largest distance of a held-out view from its nearest training view, relative to the usual distance of neighbors.
+
+A held-out view with a larger distance counts as far from all training views.
+"""
 FEWEST_IN_BAND = 4
-"""Smallest number of views in a band of heights."""
+"""Smallest number of held-out views at neighboring heights that are reported as a band without training views."""
 SAME_HEIGHT = 1e-3
-"""Difference of heights in one ring, as a share of the range of all heights."""
+"""Largest difference of two heights that count as equal, as a share of the range of all heights."""
 _ROUNDS = 10
 
 
 def chosen_views(cameras: Mapping[str, Camera], split: Split) -> tuple[str, ...]:
-    """Choose the names of the held-out views, one in ``TEST_EVERY``, sorted. A single view is not held out.
+    """Choose the held-out views and return their names, sorted.
+
+    One view in ``TEST_EVERY`` is held out. A scene with a single view has no held-out view.
 
     Args:
         cameras: cameras of the views by name.
-        split: "every-8th" for every 8th view in the order of the names from the first. "directions" for the medoids of
-            groups of neighboring views: every held-out view has training views around it, and no range of directions
-            is held out as a whole.
+        split: method of the choice. "every-8th" holds out the first view in the order of the names, and every 8th view
+            after it. "directions" divides the views into groups of neighbors, and holds out the view in the middle of
+            each group. Each held-out view then has training views around it.
     """
     names = sorted(cameras)
     if len(names) < 2:
@@ -87,7 +92,7 @@ def chosen_views(cameras: Mapping[str, Camera], split: Split) -> tuple[str, ...]
 
 
 def far_from_training(cameras: Mapping[str, Camera], tests: Sequence[str]) -> list[str]:
-    """Return the held-out views that are far from all training views, see ``FAR``, sorted."""
+    """Return the names of the held-out views that are far from all training views (see ``FAR``), sorted."""
     names = sorted(cameras)
     trains = [k for k, name in enumerate(names) if name not in tests]
     if len(names) < 3 or not trains:
@@ -99,9 +104,10 @@ def far_from_training(cameras: Mapping[str, Camera], tests: Sequence[str]) -> li
 
 
 def held_out_band(cameras: Mapping[str, Camera], tests: Sequence[str]) -> list[str]:
-    """Return the held-out views of a band of heights without training views, such as a whole ring.
+    """Return the held-out views in the largest range of heights that has no training view.
 
-    The band must have ``FEWEST_IN_BAND`` views and half of the held-out views; otherwise the list is empty. Heights are
+    An example is a capture in rings around an object, in which all views of one ring are held out. The list is empty
+    if the range has fewer than ``FEWEST_IN_BAND`` views, or less than half of the held-out views. Heights are measured
     along the mean up direction of the pictures.
     """
     names = sorted(cameras)
@@ -124,7 +130,10 @@ def held_out_band(cameras: Mapping[str, Camera], tests: Sequence[str]) -> list[s
 
 
 def _distances(cameras: Sequence[Camera]) -> NDArray[np.float64]:
-    """Return the distances [V, V] of cameras by center, relative to the spread of centers, and by viewing direction."""
+    """Return the distance of each pair of cameras, [V, V].
+
+    The distance combines the centers, relative to their spread, and the viewing directions.
+    """
     centers = np.stack([camera.center.double().numpy() for camera in cameras])
     looks = np.stack([camera.rotation[2].double().numpy() for camera in cameras])
     spread = np.linalg.norm(centers - np.median(centers, axis=0), axis=1).max()
@@ -133,15 +142,15 @@ def _distances(cameras: Sequence[Camera]) -> NDArray[np.float64]:
 
 
 def _middles(apart: NDArray[np.float64], count: int) -> list[int]:
-    """Choose the medoids of ``count`` groups of views by k-medoids, initialized with the farthest views.
+    """Divide the views into ``count`` groups by k-medoids, and return the view in the middle of each group.
 
-    Groups of one or two views have no middle. They are replaced by views of the largest groups, far from those already
-    chosen.
+    The groups are initialized with views that are far apart. A group of one or two views has no middle. It is replaced
+    by a view of a larger group that is far from all views chosen so far.
     """
     middles = [int(apart.sum(axis=1).argmin())]
     while len(middles) < count:
         reach = apart[:, middles].min(axis=1)
-        reach[middles] = -1.0  # never twice, also for cameras in one place
+        reach[middles] = -1.0  # chooses no view twice, even if all cameras are in one place
         middles.append(int(reach.argmax()))
     for _ in range(_ROUNDS):
         group = apart[:, middles].argmin(axis=1)
@@ -162,29 +171,30 @@ def _middles(apart: NDArray[np.float64], count: int) -> list[int]:
 
 
 IN_MEMORY = Path("(arrays)")
-"""Placeholder for the folder of a scene that was made of arrays."""
+"""Placeholder for the folder of a scene that was created from arrays."""
 _PICTURED = 6
-"""Number of views in a notebook's preview of a scene."""
+"""Largest number of views in the preview of a scene in a notebook."""
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Capture with posed views, sparse points and their origin.
+    """Input of a training: posed views of a capture, their split into training and held-out views, and sparse points.
 
     Attributes:
-        root: folder of the capture; ``IN_MEMORY`` for ``from_arrays``.
+        root: folder of the capture; ``IN_MEMORY`` for a scene of ``from_arrays``.
         name: name of the scene.
         views: all views, sorted by name.
         test_names: names of the held-out views, sorted.
         points: sparse points in the world, [M, 3] float32.
-        point_colors: their display-encoded colors, [M, 3] uint8.
-        refractive_index: the refractive index in ``scene.json``; None if it has none or several.
-        downscale: side of the averaged pixel boxes; 1 is full size.
+        point_colors: display-encoded colors of the points, [M, 3] uint8.
+        refractive_index: refractive index of all surfaces according to ``scene.json``. It is None if the file states
+            no refractive index or several.
+        downscale: side of the pixel boxes that were averaged; 1 for pictures at full size.
         transfer: assumed encoding of the files, "linear" or "srgb". The views are always linear.
         digest: SHA-256 of the names and contents of all files, as hexadecimal digits.
         warnings: possible faults that do not prevent the use of the scene.
-        objects: objects of ``scene.json``, if some ground truth distinguishes objects.
-        indices: refractive indices of dielectrics by their number in ``materials/``, from 3 on.
+        objects: objects that ``scene.json`` lists. It is empty if no ground truth distinguishes objects.
+        indices: refractive index of each dielectric that has a number in ``materials/``. The numbers start at 3.
     """
 
     root: Path
@@ -240,22 +250,27 @@ class Scene:
         refractive_index: float | None = None,
         name: str = "arrays",
     ) -> Scene:
-        """Create a scene in memory. Training gives the same bits as with the same pictures in a folder.
+        """Create a scene from arrays in memory.
+
+        Training on it gives exactly the same result as training on a folder with the same pictures.
 
         Args:
-            pictures: pictures of each view, [K, H, W, 3] RGB or [K, H, W] gray: uint8 or uint16 as stored by a camera,
-                or linear floats from 0 to 1 at full scale. By name, or as a sequence (with the names v000, v001, ...);
-                views may differ in size.
-            cameras: cameras of each view at the size of its pictures; see ``Camera.from_matrices``.
-            angles: angles of the K pictures in degrees counter-clockwise as displayed, ``unknown`` or ``none`` (no
-                filter); for all views, or by name.
-            points: sparse points of the surfaces in the world, such as those of structure from motion, [M, 3].
+            pictures: K pictures of each view, [K, H, W, 3] RGB or [K, H, W] gray. Values are uint8 or uint16 as stored
+                by a camera, or linear floats from 0 to 1, where 1 is full scale. Pass a mapping by view name, or a
+                sequence, whose views get the names v000, v001, ... Views may differ in size.
+            cameras: camera of each view at the size of its pictures; see ``Camera.from_matrices``.
+            angles: polarizer angles of the K pictures in degrees, counter-clockwise as displayed. An angle may also be
+                ``unknown``, or ``none`` for a picture without a filter. Pass one sequence for all views, or a mapping
+                by view name.
+            points: sparse points on the surfaces in the world, for example from structure from motion, [M, 3].
             point_colors: display-encoded colors of the points, [M, 3] uint8; default: gray.
-            masks: foreground masks of the views, [H, W] bool each.
-            invalid: masks of unusable pixels of the views, [H, W] bool each.
-            test_views: names of the held-out views; default: chosen by ``split``.
-            split, transfer, downscale: arguments of ``load_scene``.
-            mount: place of the polarizer.
+            masks: foreground mask of each view, [H, W] bool.
+            invalid: mask of the unusable pixels of each view, [H, W] bool.
+            test_views: names of the held-out views. By default, ``split`` chooses them.
+            split: method that chooses the held-out views, see ``load_scene``.
+            mount: place of the polarizer, see ``View.mount``.
+            transfer: encoding of the pictures, see ``load_scene``.
+            downscale: side of the pixel boxes that are averaged, see ``load_scene``.
             refractive_index: refractive index of the surfaces, if known.
             name: name of the scene.
 
@@ -264,7 +279,7 @@ class Scene:
             >>> polarguide.train(scene, "runs/mine")                                    # doctest: +SKIP
 
         Raises:
-            PolarguideError: an array has the wrong shape or type, or arrays do not fit each other.
+            PolarguideError: an array has the wrong shape or type, or two arrays do not match.
         """
         check_count("downscale", downscale)
         check_choice("transfer", transfer, TRANSFERS)
@@ -334,7 +349,7 @@ class Scene:
 
 
 def _sizes(views: Sequence[View]) -> str:
-    """Format the range of the views' sizes."""
+    """Return the smallest and the largest picture size as text, such as "640x480 to 800x600"."""
     sizes = sorted({(view.camera.width, view.camera.height) for view in views})
     texts = [f"{width}x{height}" for width, height in (sizes[0], sizes[-1])] if sizes else ["no"]
     return " to ".join(dict.fromkeys(texts))
@@ -404,7 +419,7 @@ def _mask(values: Array | None, where: str, size: tuple[int, int]) -> NDArray[np
 def _points_of(
     points: ArrayLike | Tensor, point_colors: ArrayLike | Tensor | None
 ) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Return points [M, 3] float32 and their colors [M, 3] uint8, by default gray."""
+    """Return the points [M, 3] as float32, and their colors [M, 3] as uint8. The default color is gray."""
     places = _rows(points, "points", np.float32)
     shades = _rows(
         np.full(places.shape, 128, np.uint8) if point_colors is None else point_colors,
@@ -418,7 +433,7 @@ def _points_of(
 
 
 def _rows(values: Any, where: str, kind: type[np.generic]) -> NDArray[Any]:
-    """Check that an array has rows of three finite numbers."""
+    """Return an array as the type ``kind`` after a check that its rows have three finite numbers."""
     array = as_numpy(values)
     _require_array(
         array.ndim == 2 and array.shape[1] == 3 and len(array) and np.isfinite(array).all(),
@@ -467,24 +482,27 @@ def load_scene(
     hold: bool = True,
     reporter: Reporter = SILENT,
 ) -> Scene:
-    """Read a capture.
+    """Read a scene from the folder of a capture.
 
-    Two layouts are supported: ``polar/<view>_000|_045|_090|_135.<suffix>``, and one folder per angle (``I-00``,
-    ``I-45``, ``I-90``, ``I-135``; also ``0``, ``045``, ``I_90``, ...) with equally named pictures. Pictures are PNG,
-    TIFF or JPEG with 8 or 16 bits, undistorted. A COLMAP model in ``sparse/0`` or ``sparse`` is required; the name of
-    an image without suffix is the view. ``masks/<view>.png``, ``invalid/<view>.png``, ``gt/<view>.npz``, ``split.json``
-    and ``scene.json`` are optional.
+    The pictures of a view are in one of two layouts. In the first, the folder ``polar/`` has the pictures
+    ``<view>_000``, ``<view>_045``, ``<view>_090`` and ``<view>_135``. In the second, each angle has a folder (``I-00``,
+    ``I-45``, ``I-90``, ``I-135``; also ``0``, ``045``, ``I_90``, ...), and the pictures of a view have the same name in
+    all four folders. Pictures are undistorted PNG, TIFF or JPEG files with 8 or 16 bits.
+
+    A COLMAP model in ``sparse/0`` or ``sparse`` is required. The name of its image without the suffix is the name of
+    the view. ``masks/<view>.png``, ``invalid/<view>.png``, ``gt/<view>.npz``, ``split.json`` and ``scene.json`` are
+    optional.
 
     Args:
         path: capture folder.
-        downscale: side of the pixel boxes over which linear values are averaged. A pixel is foreground if its whole box
-            is; it is invalid or saturated if any pixel of the box is.
+        downscale: side of the pixel boxes over which linear values are averaged. The averaged pixel is foreground if
+            all pixels of its box are foreground. It is invalid or saturated if any pixel of the box is.
         transfer: encoding of the files, "linear" or "srgb".
-        views: names of the views to read; default: all. The split is that of the whole capture.
+        views: names of the views to read; default: all. The choice does not change which views are held out.
         memory: memory limit of the pictures in GiB; default: 80 % of the free memory.
-        split: choice of held-out views for captures without ``split.json``, see ``scene.chosen_views``.
-        test_views: names of the held-out views, with precedence over ``split.json``. Missing views are ignored.
-        hold: if True, pictures stay in memory; otherwise views load them from files when they are needed.
+        split: method that chooses the held-out views of a capture without ``split.json``, see ``chosen_views``.
+        test_views: names of the held-out views, which replace ``split.json``. Names without a view are ignored.
+        hold: if True, all pictures stay in memory. If False, a view loads its pictures from files when they are used.
         reporter: reporter of the progress.
 
     Returns:
@@ -573,12 +591,17 @@ def _held_out(
     split: Split,
     test_views: Sequence[str] | None,
 ) -> tuple[tuple[str, ...], list[str]]:
-    """Return the held-out views, and a warning if some are far from training views or fill a band of heights."""
+    """Choose the held-out views, and warn about views that training views do not surround.
+
+    Returns:
+        The names of the held-out views, and a list of up to one warning. The warning names held-out views that are far
+        from all training views, or that fill a band of heights without training views.
+    """
     check_choice("split", split, get_args(Split))
     data = files.read_if_there(path, None)
     posed = frozenset(model.names)
     cameras = {name: model.camera(name) for name in layout.names if name in posed}
-    if test_views is not None:  # the user's choice needs no warning
+    if test_views is not None:  # a choice by the user causes no warning
         return tuple(name for name in sorted(test_views) if name in layout.names), []
     tests = chosen_views(cameras, split) if data is None else held_out(path, data, layout.names)
     other = (
@@ -610,10 +633,10 @@ def read_views(
     Args:
         layout: files of the capture.
         names: names of the views, sorted.
-        model: COLMAP model of the capture, if there is one. Views without a pose have no camera.
-        downscale: side of the averaged pixel boxes.
-        transfer: "linear" or "srgb".
-        hold: if True, all codes and the ground truth are kept; otherwise samples.
+        model: COLMAP model of the capture, or None. A view without a pose in the model gets no camera.
+        downscale: side of the pixel boxes that are averaged.
+        transfer: encoding of the files, "linear" or "srgb".
+        hold: if True, keep all pictures and the ground truth in memory. If False, keep a sample of the pixels.
         reporter: reporter of the progress.
 
     Raises:
@@ -648,7 +671,10 @@ def read_views(
 
 
 def _without_pictures(data: ViewData) -> ViewData:
-    """Reduce a view to the part that stays in memory if its pictures are loaded from files."""
+    """Return a view without its pictures, for scenes whose views load them on demand.
+
+    A sample of the pixels remains for checks of the exposure.
+    """
     truth = data.ground_truth
     has_objects = truth is not None and truth.object_ids is not None
     return replace(
@@ -659,11 +685,11 @@ def _without_pictures(data: ViewData) -> ViewData:
 
 
 def _content_warnings(layout: CaptureFiles, stored: StoredViews, invalid: list[str]) -> list[str]:
-    """Return warnings about views with useless pictures or with those of another view.
+    """Return warnings about views with unusable pictures, and about views with the same pictures.
 
     Args:
         layout: files of the capture.
-        stored: the views.
+        stored: pixels of the views.
         invalid: names of the views without a valid pixel.
     """
 
@@ -679,7 +705,7 @@ def _content_warnings(layout: CaptureFiles, stored: StoredViews, invalid: list[s
             views.setdefault(digests, []).append(item.name)
             if len(digests) > 1 and len(set(digests)) == 1:  # unpolarized light differs by noise
                 same_file.append(item.name)
-    # Views with black pictures only are reported with their exposure.
+    # If all pictures of a view are black, the warning about its exposure reports it.
     black = [item.name for item in stored.data if len({bool(picture.any()) for picture in item.codes}) > 1]
     gray = [item.name for item in stored.data if any(map(is_gray, item.codes))]
     copies = "; ".join(listed(names) for names in [n for n in views.values() if len(n) > 1][:3])
@@ -699,7 +725,7 @@ def _content_warnings(layout: CaptureFiles, stored: StoredViews, invalid: list[s
 
 
 def _gain_warnings(names: Sequence[str], gains: Sequence[tuple[float, float, float]]) -> list[str]:
-    """Return a warning about views with a different exposure or white balance."""
+    """Return a warning if some views differ in exposure or white balance from the mean of all views."""
     stops = {name: np.log2(gain) for name, gain in zip(names, gains, strict=True) if gain != EVEN}
     if not stops:
         return []
@@ -713,7 +739,7 @@ def _gain_warnings(names: Sequence[str], gains: Sequence[tuple[float, float, flo
 
 
 def _pose_warnings(model: ColmapModel, all_names: list[str], data: Sequence[ViewData]) -> list[str]:
-    """Return warnings about poses without pictures, and about intrinsics that were scaled to the pictures."""
+    """Return warnings about poses without pictures, and about intrinsics that were scaled to the picture size."""
     warnings = unused_poses(model, all_names)
     sizes = {item.name: (model.camera(item.name).width, model.camera(item.name).height) for item in data}
     scaled = [item.name for item in data if item.size != sizes[item.name]]

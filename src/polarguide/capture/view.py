@@ -1,4 +1,4 @@
-"""A view of a capture: a camera pose with its pictures, usually four at different polarizer angles."""
+"""View of a capture: a camera pose and the pictures from there, usually four at different polarizer angles."""
 
 from __future__ import annotations
 
@@ -37,7 +37,10 @@ _WIDTH = 160
 
 
 def figure(radiance: NDArray[Any], caption: str) -> str:
-    """Return linear radiance [H, W, 3] as HTML thumbnail with a caption. White is its 99th percentile, at most 1."""
+    """Return an HTML thumbnail with a caption for linear radiance [H, W, 3].
+
+    The 99th percentile of the radiance is displayed as white, or the value 1 if the percentile is larger.
+    """
     white = min(1.0, max(float(np.percentile(radiance, 99)), 1e-6))
     shades = srgb_encode_array(np.clip(radiance / white, 0, 1)) * 255
     height, width = shades.shape[:2]
@@ -53,7 +56,7 @@ def figure(radiance: NDArray[Any], caption: str) -> str:
 
 
 def table(title: str, facts: Mapping[str, str]) -> str:
-    """Return facts as an HTML table of two columns with a title."""
+    """Return an HTML table with a title and a row for the name and text of each fact."""
     rows = "".join(
         f'<tr><th style="text-align:left">{html.escape(name)}</th>'
         f'<td style="text-align:left;white-space:pre-line">{html.escape(text)}</td></tr>'
@@ -66,22 +69,26 @@ T = TypeVar("T")
 
 
 class Latest:
-    """Cache of one value, the last result of all loaders that share it."""
+    """Cache for the latest result of several loaders.
+
+    Attributes:
+        loaded: the loader of the cached value and the value, or None if the cache is empty.
+    """
 
     def __init__(self) -> None:
         self.loaded: tuple[object, Any] | None = None
 
 
 class Loader(Generic[T]):
-    """Lazy value of a view with a shared cache.
+    """Function without arguments that loads a value of a view, such as its pictures, when it is called.
 
-    Views are processed one after the other, and each is read several times. ``latest`` keeps only the last value, so
-    other views take no memory.
+    A view is usually used several times before the next view. The cache ``latest`` therefore keeps one value only, and
+    the other views take no memory.
 
     Args:
         make: function that creates the value.
         latest: cache that all loaders of a scene share.
-        derived: True if ``make`` calls another loader of the same cache, which then clears it.
+        derived: True if ``make`` calls another loader with the same cache. This other loader then clears the cache.
     """
 
     def __init__(self, make: Callable[[], T], latest: Latest, *, derived: bool = False) -> None:
@@ -90,7 +97,7 @@ class Loader(Generic[T]):
         self._derived = derived
 
     def __call__(self) -> T:
-        """Return the value."""
+        """Return the value from the cache, or load it."""
         latest = self._latest.loaded
         if latest is not None and latest[0] is self:
             return latest[1]
@@ -102,36 +109,38 @@ class Loader(Generic[T]):
         return value
 
     def then(self, change: Callable[[T], T]) -> Loader[T]:
-        """Return a loader of the changed value."""
+        """Return a loader that applies ``change`` to the value of this loader."""
         return Loader(lambda: change(self()), self._latest, derived=True)
 
 
 EVEN = (1.0, 1.0, 1.0)
-"""Gains of a view with the mean exposure."""
+"""Gains of R, G and B of a view whose exposure and white balance are the mean of all views."""
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """Camera pose with its pictures, usually four at different polarizer angles, and masks of their pixels.
+    """Pictures of a scene from one camera pose, usually four at different polarizer angles, and masks of their pixels.
 
-    All tensors are on one device. ``dataclasses.replace`` and methods that return another view load no pictures.
+    All tensors are on one device. The view may load its pictures from files when ``codes`` is read. Methods that
+    return another view do not load them.
 
     Attributes:
         name: name of the view, unique in its scene.
         camera: pose and intrinsics at the size of the pictures.
-        pictures: ``codes`` in memory, or their loader.
-        invalid: pixels that the capture marks as unusable (``invalid/<view>.png``), [H, W] bool. Metrics exclude these
-            pixels only.
-        saturated: pixels without polarization information: one angle at full scale in any channel, or all
-            black; [H, W] bool. Priors and losses exclude them.
-        mask: foreground mask of the user (``masks/<view>.png``), [H, W] bool, or None.
-        truth: ``ground_truth`` in memory, or its loader.
+        pictures: pictures in memory, or a loader of them. Use the property ``codes`` to read them.
+        invalid: mask of the pixels that the capture marks as unusable (``invalid/<view>.png``), [H, W] bool. Metrics
+            exclude only these pixels.
+        saturated: mask of the pixels without polarization information, [H, W] bool. One of their pictures is at full
+            scale in some channel, or all of their pictures are black. Priors and losses exclude these pixels.
+        mask: foreground mask by the user (``masks/<view>.png``), [H, W] bool, or None.
+        truth: ground truth in memory, or a loader of it. Use the property ``ground_truth`` to read it.
         exposures: polarizer angle and gain of each of the K pictures.
-        mount: place of the polarizer.
-        materials: surface labels of the user (``materials/<view>.png``), [H, W] uint8, or None: 0 no label,
-            1 dielectric, 2 metal; from 3 on, a dielectric with the refractive index ``Scene.indices[number]``.
+        mount: place of the polarizer: "sensor", or "filter" in front of the lens.
+        materials: labels of surfaces by the user (``materials/<view>.png``), [H, W] uint8, or None. The label 0 means
+            unlabeled, 1 dielectric and 2 metal. A larger label means a dielectric with the refractive index
+            ``Scene.indices[label]``.
         subject_only: if True, ``codes`` are 0 outside the mask.
-        gains: exposure of R, G and B relative to other views, in addition to ``exposures``.
+        gains: exposure of R, G and B relative to the other views, in addition to the gains in ``exposures``.
     """
 
     name: str
@@ -149,13 +158,13 @@ class View:
 
     @property
     def codes(self) -> Tensor:
-        """Linear intensities of the exposures as codes round(65535 * intensity), [K, H, W, 3] uint16, RGB.
+        """Linear intensities of the K pictures as 16-bit codes ``round(65535 * intensity)``, [K, H, W, 3] uint16, RGB.
 
-        The angles are 0, 45, 90 and 135 degrees unless ``exposures`` differ. Large captures do not fit into memory as
-        floats.
+        ``exposures`` has the angle of each picture, usually 0, 45, 90 and 135 degrees. Codes take half the memory of
+        floating-point numbers.
 
         Raises:
-            PolarguideError: a file of the view has changed or was deleted.
+            PolarguideError: a file of the view was changed or deleted.
         """
         codes = self.pictures() if isinstance(self.pictures, Loader) else self.pictures
         if not self.subject_only or self.mask is None:
@@ -167,7 +176,7 @@ class View:
         """Ground truth of the view, or None.
 
         Raises:
-            PolarguideError: the file has changed or was deleted.
+            PolarguideError: the file was changed or deleted.
         """
         return self.truth() if isinstance(self.truth, Loader) else self.truth
 
@@ -193,7 +202,7 @@ class View:
 
     @property
     def is_four(self) -> bool:
-        """True for the four pictures of a polarization camera."""
+        """True if the view has the four pictures of a polarization camera, at 0, 45, 90 and 135 degrees."""
         return self.mount == "sensor" and self.exposures == FOUR
 
     @property
@@ -207,7 +216,10 @@ class View:
         return self.exposures == FOUR or measure_radiance(self.exposures)
 
     def to(self, device: torch.device) -> View:
-        """Return the view on a device, without ground truth; the view itself if it is already there."""
+        """Return a copy of the view on a device, without ground truth.
+
+        If the view is already on the device, return it unchanged.
+        """
         if self.device == device:
             return self
         moved = self.changed(lambda codes: codes.to(device))
@@ -223,29 +235,32 @@ class View:
     def changed(
         self, change: Callable[[Tensor], Tensor], exposures: tuple[Exposure, ...] | None = None
     ) -> View:
-        """Return the view with other pictures, which are computed now if the view's are in memory, else on demand.
+        """Return the view with pictures that ``change`` computes.
+
+        The pictures are computed at once if this view has its pictures in memory. Otherwise they are computed when
+        they are read.
 
         Args:
-            change: function that computes new codes from those of the view.
-            exposures: exposures of the new pictures; default: unchanged.
+            change: function that computes the new codes from the codes of this view.
+            exposures: exposures of the new pictures; default: those of this view.
         """
         pictures = self.pictures
         new = pictures.then(change) if isinstance(pictures, Loader) else change(pictures)
         return replace(self, pictures=new, exposures=self.exposures if exposures is None else exposures)
 
     def with_exposures(self, exposures: tuple[Exposure, ...]) -> View:
-        """Return the view with other exposures of the same pictures."""
+        """Return the view with the same pictures but other exposures."""
         return replace(self, exposures=exposures)
 
     def masked(self) -> View:
-        """Return the view with black pixels outside its mask, which is required."""
+        """Return the view with black pixels outside its mask. The view must have a mask."""
         assert self.mask is not None
         return replace(self, subject_only=True)
 
     def intensities(self) -> Tensor:
-        """Return linear intensities of the exposures on one scale, [K, H, W, 3] float32.
+        """Return the linear intensities of the K pictures, divided by their gains, [K, H, W, 3] float32.
 
-        They are in [0, 1] unless gains differ.
+        The values are in [0, 1] if all gains are 1.
         """
         intensities = self._even(self.codes.to(torch.float32) / FULL_CODE)
         gains = [exposure.gain for exposure in self.exposures]
@@ -258,10 +273,10 @@ class View:
         return intensities if self.gains == EVEN else intensities / intensities.new_tensor(self.gains)
 
     def stokes(self) -> Tensor:
-        """Return Stokes vectors [3, H, W, 3] in the lens frame, by least squares.
+        """Return the Stokes vectors in the lens frame, [3, H, W, 3]. They are fitted by least squares.
 
         Raises:
-            PolarguideError: the pictures do not determine them, see ``is_determined``.
+            PolarguideError: the pictures do not determine Stokes vectors, see ``is_determined``.
         """
         if self.is_four:
             return optics.stokes(self.intensities())
@@ -274,9 +289,10 @@ class View:
         return optics.fitted_stokes(self.intensities()[places], rows)
 
     def photograph(self) -> Tensor:
-        """Return linear S0 / 2 in [0, 1], [H, W, 3] float32: the mean of the four pictures.
+        """Return the picture without a polarizer, as linear ``S0 / 2`` in [0, 1], [H, W, 3] float32.
 
-        If the pictures do not measure S0 (see ``measures_radiance``), it is the mean of those with the most light.
+        It is the mean of the pictures of a polarization camera. If the pictures do not measure S0 (see
+        ``measures_radiance``), the result is the mean of the available pictures.
         """
         if self.is_four:
             return self._even(self.codes.to(torch.float32).mean(dim=0) / FULL_CODE)
@@ -286,7 +302,11 @@ class View:
         return (self.intensities()[list(places)] if places else self.intensities()).mean(dim=0)
 
     def undetermined(self, what: str) -> PolarguideError:
-        """Return the error that the pictures do not determine a quantity."""
+        """Return the error for pictures that do not determine a quantity.
+
+        Args:
+            what: name of the quantity, such as "a Stokes vector".
+        """
         angles = ", ".join(exposure.label for exposure in self.exposures)
         return PolarguideError(
             f"view {self.name}",

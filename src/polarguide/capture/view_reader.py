@@ -1,4 +1,4 @@
-"""Read views from files, and check pictures in arrays."""
+"""Read the pictures and masks of views from files, and check pictures in arrays."""
 
 from __future__ import annotations
 
@@ -39,29 +39,29 @@ from polarguide.geometry.camera import Camera
 from polarguide.optics import Mount
 
 Array = NDArray[Any] | Tensor
-"""Array of NumPy, or tensor of torch on any device."""
+"""NumPy array, or torch tensor on any device."""
 _PICTURES = "pictures [K, H, W] or [K, H, W, 3] of uint8, uint16, or linear floats from 0 to 1"
 
 
 def as_numpy(values: ArrayLike | Tensor) -> NDArray[Any]:
-    """Convert an array or a tensor on any device to NumPy, without a copy if possible."""
+    """Convert an array or a tensor to a NumPy array, without a copy if possible."""
     return values.detach().cpu().numpy() if isinstance(values, Tensor) else np.asarray(values)
 
 
 def kind_of(array: NDArray[Any]) -> str:
-    """Describe type and shape for messages."""
+    """Describe the type and shape of an array for messages."""
     return f"{array.dtype} of shape {list(array.shape)}"
 
 
 def stored_pictures(pictures: Array, where: str) -> NDArray[Any]:
-    """Convert pictures to stored values [K, H, W, 3] uint8 or uint16. Floats become 16-bit codes.
+    """Convert the pictures of a view to uint8 or uint16, [K, H, W, 3]. Floats are converted to 16-bit codes.
 
     Args:
         pictures: [K, H, W] or [K, H, W, 3].
         where: name of the pictures for messages.
 
     Raises:
-        PolarguideError: the pictures have another shape or type, or floats outside 0 to 1.
+        PolarguideError: the shape or type of the pictures is invalid, or a float is not in [0, 1].
     """
     values = as_numpy(pictures)
     require(
@@ -93,10 +93,10 @@ def stored_pictures(pictures: Array, where: str) -> NDArray[Any]:
 
 
 def exposures_of(angles: Sequence[Angle], count: int, where: str) -> tuple[Exposure, ...]:
-    """Return the exposures of ``count`` pictures by their angles.
+    """Return exposures with the given angles and gain 1.
 
     Raises:
-        PolarguideError: the number of angles differs, or an angle is invalid.
+        PolarguideError: the number of angles is not ``count``, or an angle is invalid.
     """
     require(
         len(angles) == count,
@@ -128,7 +128,11 @@ def _exposure(angle: Angle, where: str) -> Exposure:
 def in_order(
     stored: NDArray[Any], exposures: tuple[Exposure, ...]
 ) -> tuple[NDArray[Any], tuple[Exposure, ...]]:
-    """Sort pictures at 0, 45, 90 and 135 degrees into this order; other pictures stay as they are."""
+    """Sort four pictures at 0, 45, 90 and 135 degrees by angle. Return pictures at other angles unchanged.
+
+    Returns:
+        The pictures, and their exposures in the same order.
+    """
     if exposures != FOUR and len(exposures) == len(FOUR) and {*exposures} == {*FOUR}:
         return stored[[exposures.index(each) for each in FOUR]], FOUR
     return stored, exposures
@@ -137,7 +141,12 @@ def in_order(
 def by_name(
     values: Mapping[str, Any] | Sequence[Any] | Array, kind: str, names: Sequence[str] = ()
 ) -> dict[str, Any]:
-    """Return values by view, of a mapping or in the order of ``names``. The default names are v000, v001, ...
+    """Return a mapping from view names to values.
+
+    Args:
+        values: a mapping by view name, or a sequence in the order of ``names``.
+        kind: name of the values for messages, such as "cameras".
+        names: required view names. By default, the values of a sequence get the names v000, v001, ...
 
     Raises:
         PolarguideError: the names differ from ``names``, or there are no values.
@@ -162,10 +171,10 @@ T = TypeVar("T")
 
 
 class Files:
-    """Reader of files that records their SHA-256.
+    """Reader of files that records the SHA-256 of each file, to detect later changes.
 
     Args:
-        known: required SHA-256 of the files; default: any.
+        known: SHA-256 that each file must have. By default, files are not compared.
     """
 
     def __init__(self, known: Mapping[Path, str] | None = None) -> None:
@@ -192,7 +201,7 @@ class Files:
         return data
 
     def digest(self, root: Path) -> str:
-        """Return the SHA-256 over names in ``root`` and contents of all files that were read."""
+        """Return one SHA-256 of all files that were read, computed from their names in ``root`` and their contents."""
         lines = sorted(
             f"{canonical(path.relative_to(root).as_posix())} {digest}\n"
             for path, digest in self.digests.items()
@@ -200,23 +209,31 @@ class Files:
         return hashlib.sha256("".join(lines).encode()).hexdigest()
 
     def read_if_there(self, path: Path, default: T) -> bytes | T:
-        """Read a JSON file; return ``default`` if it is missing. A dangling link is not missing."""
+        """Read a JSON file, or return ``default`` if it does not exist. A broken link causes an error."""
         return self.read(path, LARGEST_RECORD) if os.path.lexists(path) else default
 
 
 @dataclass(frozen=True, eq=False)
 class ViewData:
-    """Pixels of a view before the full scale of the whole capture is known.
+    """Pixels of a view as read from its files.
+
+    The saturated pixels are determined later, because the saturation value depends on all views of the capture.
 
     Attributes:
-        name, codes, invalid, mask, materials, ground_truth, exposures: attributes of ``View``, as arrays.
-        material_numbers: numbers in the stored picture of materials.
+        name: name of the view.
+        codes: linear codes of the pictures, see ``View.codes``.
+        invalid: mask of unusable pixels, see ``View.invalid``.
+        mask: foreground mask, see ``View.mask``.
+        materials: labels of surfaces, see ``View.materials``.
+        material_numbers: labels that occur in the file of materials.
+        ground_truth: ground truth, see ``View.ground_truth``.
         size: width and height of the stored pictures.
-        peak: largest stored value over angles, channels and the pixels of a box, [H, W].
-        black: mask of boxes with a pixel that is 0 in all angles and channels, [H, W].
-        histogram: ``checks.top_histogram`` of the stored values.
-        digests: SHA-256 of every file.
-        samples: samples at observed points for the comparison of exposures; None without it.
+        peak: largest stored value in each averaged box, over all angles and channels, [H, W].
+        black: mask of the averaged boxes with a pixel that is 0 at all angles and in all channels, [H, W].
+        histogram: result of ``checks.top_histogram`` for the stored values.
+        digests: SHA-256 of each file.
+        exposures: polarizer angle and gain of each picture.
+        samples: intensities at 3D points, by which exposures of views are compared; None if they are not compared.
     """
 
     name: str
@@ -235,7 +252,11 @@ class ViewData:
     samples: PointSamples | None = None
 
     def saturated(self, scale: int | None) -> NDArray[np.bool_]:
-        """Return ``View.saturated``, given the stored value of saturation (None: no saturation)."""
+        """Return the mask ``View.saturated``.
+
+        Args:
+            scale: stored value at which pixels are saturated; None if no pixel of the capture is saturated.
+        """
         return self.black if scale is None else np.asarray(self.black | (self.peak >= scale))
 
     def view(
@@ -246,14 +267,14 @@ class ViewData:
         files: ViewFiles | None = None,
         gains: tuple[float, float, float] = EVEN,
     ) -> View:
-        """Create the view with its camera and its saturated pixels.
+        """Create the view.
 
         Args:
             camera: camera of the view.
-            scale: stored value of saturation, see ``saturated``.
+            scale: stored value at which pixels are saturated, see ``saturated``.
             mount: place of the polarizer.
-            files: loaders of codes and ground truth; default: they stay in memory.
-            gains: attribute of ``View``.
+            files: loaders of pictures and ground truth. By default, the view keeps both in memory.
+            gains: exposure of R, G and B relative to the other views, see ``View.gains``.
         """
         invalid = torch.from_numpy(self.invalid)
         saturated = torch.from_numpy(self.saturated(scale))
@@ -273,12 +294,13 @@ class ViewData:
 
 
 class ViewFiles:
-    """Loaders of the files of views.
+    """Factory of loaders, with which views read their pictures and ground truth when they are used.
 
     Args:
         layout: files of the capture.
-        factor, transfer: arguments of ``read_view``.
-        digests: SHA-256 of the files when the scene was read.
+        factor: side of the pixel boxes that are averaged.
+        transfer: encoding of the pictures.
+        digests: SHA-256 of the files when the scene was opened. A loader refuses a file that has changed since.
     """
 
     def __init__(self, layout: CaptureFiles, factor: int, transfer: str, digests: Mapping[Path, str]) -> None:
@@ -290,16 +312,19 @@ class ViewFiles:
         self._truths = Latest()
 
     def codes(self, name: str) -> Loader[Tensor]:
-        """Return a loader of ``View.codes``, which raises an error if a file was changed or deleted."""
+        """Return a loader of the pictures of a view.
+
+        The loader raises an error if a file was changed or deleted after the scene was opened.
+        """
         return Loader(functools.partial(self._read_codes, name), self._pictures)
 
     def ground_truth(self, name: str, size: tuple[int, int]) -> Loader[GroundTruth | None] | None:
-        """Return a loader of ``View.ground_truth``, or None without ground truth of this view.
+        """Return a loader of the ground truth of a view, or None if the view has no ground truth.
 
         The loader raises an error if the file was changed or deleted after the scene was opened.
 
         Args:
-            name: view name.
+            name: name of the view.
             size: width and height of the stored pictures.
         """
         path = self._layout.ground_truth.get(name)
@@ -319,7 +344,7 @@ class ViewFiles:
 
 
 def _compact(mask: Tensor) -> Tensor:
-    """Return the mask in a form that takes no memory if it is empty."""
+    """Convert a mask to a tensor. A mask without marked pixels takes almost no memory."""
     return mask if bool(mask.any()) else torch.zeros((), dtype=torch.bool).expand(mask.shape)
 
 
@@ -328,7 +353,7 @@ _DECODERS: dict[str, Callable[[Path, bytes], NDArray[Any]]] = {
     "mask": functools.partial(decode_mask, any_value=False),
     "materials": decode_materials,
 }
-"""Decoders of a view's optional pictures by kind."""
+"""Function that decodes each kind of optional picture of a view, such as its mask."""
 
 
 def read_view(
@@ -378,10 +403,10 @@ def read_view(
 
 
 def require_factor(factor: int, height: int, width: int) -> None:
-    """Check that boxes of ``factor`` x ``factor`` pixels fit into a picture.
+    """Check that a box of ``factor`` x ``factor`` pixels fits into a picture.
 
     Raises:
-        PolarguideError: the boxes do not fit.
+        PolarguideError: the picture is smaller than the box.
     """
     require(
         factor <= min(height, width),
@@ -405,15 +430,19 @@ def view_data(
     ground_truth: GroundTruth | None = None,
     digests: Mapping[Path, str] | None = None,
 ) -> ViewData:
-    """Average the stored pictures [H, W, 3] of a view over boxes of ``factor`` x ``factor`` pixels.
+    """Create the data of a view from stored pictures and masks, averaged over boxes of ``factor`` x ``factor`` pixels.
 
     Args:
-        name, exposures, digests: attributes of ``ViewData``.
-        raw: stored pictures, uint8 or uint16, of one shape and type.
+        name: name of the view.
+        raw: stored pictures, [H, W, 3] each, all uint8 or all uint16.
+        exposures: polarizer angle and gain of each picture.
         factor: side of the boxes.
         transfer: encoding of the pictures.
-        invalid, mask, materials: full-size masks and labels, [H, W].
-        ground_truth: ground truth, already averaged.
+        invalid: mask of unusable pixels at full size, [H, W], or None.
+        mask: foreground mask at full size, [H, W], or None.
+        materials: labels of surfaces at full size, [H, W], or None.
+        ground_truth: ground truth after averaging, or None.
+        digests: SHA-256 of each file.
     """
     height, width = raw[0].shape[:2]
     peak = functools.reduce(np.maximum, [pixels[..., channel] for pixels in raw for channel in range(3)])
@@ -437,10 +466,10 @@ def view_data(
 
 
 def check_materials(layout: CaptureFiles, views: Iterable[ViewData], indices: Mapping[int, float]) -> None:
-    """Refuse numbers of materials without a definition.
+    """Refuse labels of dielectrics without a refractive index in ``scene.json``.
 
     Raises:
-        PolarguideError: a picture has a number that ``indices`` lacks.
+        PolarguideError: a picture of materials has a label that ``indices`` lacks.
     """
     for view in views:
         if unknown := view.material_numbers - {0, 1, 2, *indices}:
@@ -453,12 +482,12 @@ def check_materials(layout: CaptureFiles, views: Iterable[ViewData], indices: Ma
 
 
 def _codes(raw: Sequence[NDArray[Any]], transfer: str, factor: int) -> NDArray[np.uint16]:
-    """Return linear codes of stored pictures, averaged over boxes."""
+    """Convert stored pictures to linear codes, and average them over boxes of ``factor`` x ``factor`` pixels."""
     return np.stack([boxes.mean_codes(linear_codes(pixels, transfer), factor) for pixels in raw])
 
 
 def _read_pictures(files: Files, paths: list[Path]) -> list[NDArray[Any]]:
-    """Read the pictures of a view, [H, W, 3] each, of one size and one depth."""
+    """Read the pictures of a view, [H, W, 3] each, and check that they have the same size and bit depth."""
     pictures: list[NDArray[Any]] = []
     for path in paths:
         data = files.picture(path)
@@ -472,13 +501,13 @@ def _read_pictures(files: Files, paths: list[Path]) -> list[NDArray[Any]]:
 
 
 def require_size(path: Path, data: bytes, size: Sequence[int], *, like: Path | None = None) -> None:
-    """Refuse a picture whose header states another size, before memory is allocated to decode it.
+    """Refuse a picture of the wrong size by its header, before memory is allocated to decode it.
 
     Args:
         path: path of the file.
         data: content of the file.
-        size: expected height and width.
-        like: file of this size for the message.
+        size: required height and width.
+        like: another file with the required size, which the message names.
 
     Raises:
         PolarguideError: the header states another size.
@@ -497,10 +526,10 @@ def require_size(path: Path, data: bytes, size: Sequence[int], *, like: Path | N
 
 
 def require_alike(path: Path, picture: NDArray[Any], first_path: Path, first: NDArray[Any]) -> None:
-    """Check that a picture has the size and depth of the first one of its view.
+    """Check that a picture has the same size and bit depth as the first picture of its view.
 
     Raises:
-        PolarguideError: size or depth differs.
+        PolarguideError: the size or the bit depth differs.
     """
     if (picture.shape, picture.dtype) != (first.shape, first.dtype):
         own, expected = (
@@ -521,7 +550,10 @@ def _read_optional(
     size: Sequence[int],
     decode: Callable[[Path, bytes], NDArray[Any]],
 ) -> NDArray[Any] | None:
-    """Read an optional picture of a view, which must have the size of its pictures; None if it is missing."""
+    """Read an optional picture of a view, such as a mask. Return None if the file does not exist.
+
+    The picture must have height and width ``size``.
+    """
     if name not in folder:
         return None
     path = folder[name]
@@ -532,15 +564,15 @@ def _read_optional(
 
 @dataclass(frozen=True, eq=False)
 class StoredViews:
-    """Views of a capture as read, with or without a pose.
+    """Views of a capture as read from its files, with statistics of all views.
 
     Attributes:
-        data: views, sorted by name.
-        cameras: camera of each view at the size of its averaged pictures; None without a pose.
-        measures: ``checks.measure`` of each view.
+        data: pixels of the views, sorted by name.
+        cameras: camera of each view at the size of its averaged pictures; None for a view without a pose.
+        measures: result of ``checks.measure`` for each view.
         largest_value: largest value that the files can store, 255 or 65535.
-        full_scale: stored value of saturation; None if no pixel is saturated.
-        exposures: exposures of the views at common points; None if they are not compared.
+        full_scale: stored value at which pixels are saturated; None if no pixel is saturated.
+        exposures: relative exposures of the views, measured at common 3D points; None if they are not compared.
     """
 
     data: tuple[ViewData, ...]
@@ -557,7 +589,7 @@ class StoredViews:
         cameras: Sequence[Camera | None],
         points: ComparedPoints | None = None,
     ) -> StoredViews:
-        """Measure views, detect saturation, and compare exposures at points.
+        """Create the statistics of views: brightness, saturation, and exposures at common 3D points.
 
         Raises:
             PolarguideError: the views differ in bit depth.

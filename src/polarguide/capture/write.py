@@ -22,20 +22,20 @@ _FILTERS = (cv2.IMWRITE_PNG_FILTER_SUB, cv2.IMWRITE_PNG_FILTER_NONE)
 _SAMPLE_ROWS = 64
 _LEVEL = 6
 Rounding = Sequence[tuple[int, int]]
-"""Pairs of the first code of a range and the step to which codes of this range are rounded."""
+"""Rounding of codes by ranges: the first code of each range, and the step to whose multiples its codes are rounded."""
 EXACT: Rounding = ((0, 1),)
 
 
 def rounding_of(values: NDArray[np.floating[Any]]) -> list[tuple[int, int]]:
-    """Choose steps of codes: the power of two nearest to a quarter of the camera's step, at least 1.
+    """Choose steps to which codes are rounded, so that files become smaller.
 
-    The error is less than a fifth of the camera's step, whose own rounding error is half a step. Files shrink, because
-    low bits are unused.
+    A step is the power of two nearest to a quarter of the difference of two successive values of the camera, and at
+    least 1. Rounding to it causes an error of less than a fifth of the camera's own step.
 
     Args:
         values: the camera's values as 16-bit codes, ascending, [N] with N > 1.
     """
-    # Steps may grow with the values, as in sRGB. A step is at most as large as the next ones.
+    # Steps may grow with the values, as in sRGB. No step is larger than the steps of larger values.
     steps = np.minimum.accumulate(np.diff(values)[::-1])[::-1]
     multiples = np.exp2(np.round(np.log2(np.maximum(steps / 4, 1)))).astype(int)
     changes = np.flatnonzero(np.diff(multiples, prepend=0))
@@ -47,9 +47,10 @@ def rounding_of(values: NDArray[np.floating[Any]]) -> list[tuple[int, int]]:
 def intensity_codes(
     intensities: NDArray[np.float32], invalid: NDArray[np.bool_], rounding: Rounding = EXACT
 ) -> NDArray[np.uint16]:
-    """Convert linear intensities [K, H, W, 3] in [0, 1] to 16-bit codes with rounding.
+    """Convert linear intensities [K, H, W, 3] in [0, 1] to rounded 16-bit codes.
 
-    Only invalid pixels [H, W] may have the largest code, because readers interpret it as saturation.
+    Readers interpret the largest code as saturation. Pixels outside the mask ``invalid`` [H, W] therefore get smaller
+    codes.
     """
     values = np.clip(intensities, 0.0, 1.0) * np.float32(FULL_CODE)
     multiples: Any = np.float32(rounding[0][1])
@@ -80,13 +81,13 @@ def write_view(
     mask: NDArray[np.bool_] | None = None,
     angles: Sequence[Angle] = ANGLES,
 ) -> dict[str, int]:
-    """Write the pictures of a view.
+    """Write the pictures and masks of a view to a scene folder.
 
     Args:
         root: scene folder.
         view: name of the view.
-        codes: linear 16-bit codes at ``angles``, [K, H, W, 3] RGB. Equal channels, such as those of a gray sensor,
-            are written as one.
+        codes: linear 16-bit codes of the pictures, [K, H, W, 3] RGB. If all three channels are equal, one channel is
+            written.
         invalid: mask of unusable pixels, [H, W].
         mask: foreground mask, [H, W].
         angles: angles of the pictures.

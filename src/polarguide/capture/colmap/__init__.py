@@ -5,6 +5,6 @@ import importlib
 
 from polarguide.core.system import sigterm_kept
 
-# pycolmap prints a stack trace at SIGTERM, where a process should just end.
+# pycolmap prints a stack trace when a process receives SIGTERM. The process should end without it.
 with contextlib.suppress(ImportError), sigterm_kept():
     importlib.import_module("pycolmap")

@@ -30,7 +30,7 @@ MODELS = {
     "OPENCV_FISHEYE": (5, 8), "FULL_OPENCV": (6, 12), "FOV": (7, 5), "SIMPLE_RADIAL_FISHEYE": (8, 4),
     "RADIAL_FISHEYE": (9, 5), "THIN_PRISM_FISHEYE": (10, 12),
 }  # fmt: skip
-"""Id and number of parameters of COLMAP's camera models by name."""
+"""Id and number of parameters of each of COLMAP's camera models."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +40,7 @@ class PosedCamera:
     Attributes:
         width, height: picture size in pixels.
         model: camera model, a key of ``MODELS``.
-        parameters: parameters of the model; pixel centers are at 0.5.
+        parameters: parameters of the camera model. The center of the first pixel is at (0.5, 0.5).
         rotation: rotation from world to camera, [3, 3].
         translation: translation from world to camera, [3].
     """
@@ -54,7 +54,7 @@ class PosedCamera:
 
     @property
     def intrinsics(self) -> tuple[Any, ...]:
-        """Model, size and parameters; equal for pictures of one camera."""
+        """Model, width, height and parameters, which are equal for all pictures of a camera."""
         return (self.model, self.width, self.height, *self.parameters)
 
     @property
@@ -78,7 +78,7 @@ def posed_model(
 
     Args:
         cameras: cameras by view name.
-        numbers: ids of each view's image and camera; default: counted from 1.
+        numbers: ids of the image and the camera by view. By default, ids are 1, 2, ...
     """
     model = pycolmap.Reconstruction()
     ids: dict[tuple[object, ...], int] = {}
@@ -151,7 +151,7 @@ def check_model_files(folder: Path, kind: str) -> None:
 
 
 _HEAD = 1 << 16
-"""Number of bytes in which a decimal comma is searched; a program writes all lines alike."""
+"""Number of bytes at the start of a text file that are searched for a decimal comma."""
 
 
 def _decimal_comma(data: bytes) -> str:
@@ -164,9 +164,9 @@ def _decimal_comma(data: bytes) -> str:
 
 
 def _invalid_color(data: bytes) -> str | None:
-    """Describe the first color in ``points3D.txt`` that is not in 0..255; None if all are.
+    """Describe the first color in ``points3D.txt`` that is not in the range 0 to 255. Return None if all are valid.
 
-    pycolmap takes such colors modulo 256. It refuses colors that are not numbers itself.
+    pycolmap reads such a color modulo 256 without an error.
     """
     for number, line in enumerate(data.splitlines(), 1):
         cells = line.split(None, 7)[4:7]
@@ -193,12 +193,12 @@ def _cameras(data: bytes) -> int:
 
 
 def _lists(data: bytes, head: Callable[[bytes, int], int], counter: str, entry: int) -> int:
-    """Return the end of records of a head, a count and as many entries.
+    """Return the end of the records in a file. A record consists of a head, a number of entries, and the entries.
 
     Args:
         data: the whole file.
-        head: function that returns the end of the head at an offset.
-        counter: type of the count for ``struct``.
+        head: function that returns the end of the head that starts at an offset.
+        counter: type of the number of entries as a format of ``struct``.
         entry: size of an entry in bytes.
     """
     (count,) = struct.unpack_from("<Q", data)
@@ -212,7 +212,7 @@ def _lists(data: bytes, head: Callable[[bytes, int], int], counter: str, entry: 
 
 
 def _image(data: bytes, at: int) -> int:
-    """Return the end of an image's pose and name at an offset of ``images.bin``."""
+    """Return the end of an image's pose and name in ``images.bin``. They start at the offset ``at``."""
     if not all(map(math.isfinite, struct.unpack_from("<7d", data, at + 4))):
         raise ValueError("an image whose pose is not finite")
     name = data.find(b"\0", at + 64, at + 64 + _LONGEST_NAME)
@@ -239,7 +239,7 @@ def _rigs(data: bytes) -> int:
 
 
 def _checked_count(count: int, most: int) -> int:
-    """Return the count of a record; raise ValueError if it exceeds the length of the file."""
+    """Return the number of entries of a record. Raise ValueError if the file is too short for it."""
     if count > most:
         raise ValueError(f"a count of {count}, too many for the length of the file")
     return count
@@ -247,25 +247,25 @@ def _checked_count(count: int, most: int) -> int:
 
 _NUMBER = re.compile(rb"[-+]?(?:(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?|nan|inf)", re.IGNORECASE)
 _POSE = 9
-"""Number of values before the name of an image: id, quaternion, translation, camera."""
+"""Number of values before the name in a line of ``images.txt``: id, quaternion, translation and camera."""
 _PLACE = 3
-"""Number of values of an observation: x, y and the id of a point. Only the first observation is parsed here."""
+"""Number of values of an observation in ``images.txt``: x, y and the id of a point."""
 
 
 def read_text_images(data: bytes) -> tuple[bytes, dict[int, str]]:
-    """Replace the image names in an ``images.txt`` by numbers. pycolmap cuts names at blanks.
+    """Replace the image names in ``images.txt`` by numbers, because pycolmap cuts names at blanks.
 
-    The lines must alternate between images and observations. Otherwise pycolmap would skip every other image.
+    Lines of images and lines of observations must alternate. Otherwise pycolmap would skip every second image.
 
     Returns:
-        The file with numbers as names, and the names by image id.
+        The content of the file with numbers as names; and the original names by image id.
 
     Raises:
         ValueError: images and observations do not alternate, or a name is not UTF-8.
     """
     out: list[bytes] = []
     names: dict[int, str] = {}
-    number: int | None = None  # image whose observations are in the next line
+    number: int | None = None  # id of the image whose observations are in the next line
     for count, line in enumerate(data.splitlines(), 1):
         cells = line.split()
         if number is not None:
@@ -292,12 +292,12 @@ def read_text_images(data: bytes) -> tuple[bytes, dict[int, str]]:
 
 MODEL_FILES = ("cameras", "images", "points3D", "rigs", "frames")
 PINHOLES = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
-"""Perspective camera models. They are pinhole cameras if all of their distortion parameters are zero."""
+"""Camera models that describe a pinhole camera if all of their distortion parameters are zero."""
 
 
 @dataclass(frozen=True, eq=False)
 class ColmapModel:
-    """Poses, intrinsics and points of a COLMAP model.
+    """COLMAP model that was read from files: poses, intrinsics and points.
 
     Attributes:
         folder: folder of the files.
@@ -323,10 +323,10 @@ class ColmapModel:
         return sorted(self._images)
 
     def camera(self, view: str) -> Camera:
-        """Return the camera of a view, at the size that the model states.
+        """Return the camera of a view at the picture size in the model.
 
         Raises:
-            PolarguideError: the model has no image of this view or several, or its camera is distorted or invalid.
+            PolarguideError: the model has no image of this view, or several. Or the camera is distorted or invalid.
         """
         images = self._images.get(view, [])
         if len(images) != 1:
@@ -341,7 +341,11 @@ class ColmapModel:
         return _camera_of(self.folder, images[0], self._cameras[images[0].camera_id])
 
     def correspondences(self, view: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return a view's observations in pixels, at the size that the model states [N, 2], and their points [N, 3]."""
+        """Return the points that a view observes.
+
+        Returns:
+            The observed positions in pixels at the picture size in the model, [N, 2]; and the 3D points, [N, 3].
+        """
         pairs = [
             (point.xy, self._rows[point.point3D_id])
             for image in self._images.get(view, [])[:1]
@@ -352,7 +356,10 @@ class ColmapModel:
         return pixels, self.points.double().numpy()[[row for _, row in pairs]]
 
     def observations(self, views: Sequence[str]) -> Tensor:
-        """Return a mask of the views that observe each point, [M, V]; all False for a model without tracks."""
+        """Return a mask of the views that observe each point, [M, V].
+
+        It is False everywhere if the model does not store the observations.
+        """
         columns = {
             image.image_id: column
             for column, view in enumerate(views)
@@ -397,7 +404,7 @@ def fit_camera(camera: Camera, width: int, height: int, *, folder: Path, view: s
     """Scale a camera to the size of the pictures.
 
     Raises:
-        PolarguideError: the two sizes differ by more than one common factor.
+        PolarguideError: the aspect ratios of the two sizes differ.
     """
     if (camera.width, camera.height) == (width, height):
         return camera
@@ -412,7 +419,7 @@ def fit_camera(camera: Camera, width: int, height: int, *, folder: Path, view: s
 
 
 def unused_poses(model: ColmapModel, names: list[str]) -> list[str]:
-    """Return a warning about posed images without a view in the capture, if there are any."""
+    """Return a list with a warning if the model has images without a view in the capture; otherwise an empty list."""
     unused = sorted(set(model.names) - set(names))
     if not unused:
         return []
@@ -495,11 +502,11 @@ def load_model(folder: Path, kind: str) -> Any:
 
 
 _DIGITS = 1e-5
-"""Relative difference of equal numbers of two models; programs write as few as six digits as text."""
+"""Largest relative difference of two numbers that count as equal. Some programs write only six digits as text."""
 
 
 def other_text_model(folder: Path, kind: str, model: Any) -> list[str]:
-    """Return a warning if text files next to a binary model have other content.
+    """Return a list with a warning if text files next to a binary model have different content.
 
     Args:
         folder: folder of the model.
@@ -521,7 +528,10 @@ def other_text_model(folder: Path, kind: str, model: Any) -> list[str]:
 
 
 def _differing(model: Any, other: Any) -> list[str]:
-    """Return the names of images that only one of two models has, or whose poses or cameras differ."""
+    """Return the names of the images that differ between two models.
+
+    An image differs if one of the models lacks it, or if its poses or cameras differ.
+    """
     first, second = (
         {
             image.name: (image.cam_from_world(), m.cameras[image.camera_id])
@@ -548,7 +558,11 @@ def _differing(model: Any, other: Any) -> list[str]:
 
 @contextlib.contextmanager
 def _complete_files(folder: Path, kind: str, images: bytes | None = None) -> Iterator[Path]:
-    """Yield ``folder`` if it is complete, else a copy with an empty file of points or with ``images``."""
+    """Yield a folder in which pycolmap can read the model.
+
+    It is ``folder`` if all files exist and need no change. Otherwise it is a temporary copy, to which an empty file of
+    points is added if necessary. The content ``images`` replaces the file of images.
+    """
     if images is None and (folder / ("points3D" + kind)).exists():
         yield folder
         return
@@ -564,7 +578,7 @@ def _complete_files(folder: Path, kind: str, images: bytes | None = None) -> Ite
 
 
 def posed_images(model: Any, views: Collection[str] = ()) -> dict[str, list[Any]]:
-    """Group the posed images of pycolmap's ``Reconstruction`` by the view of their name."""
+    """Return the images with a pose in pycolmap's ``Reconstruction``, grouped by view."""
     images: dict[str, list[Any]] = {}
     for number, image in model.images.items():
         if image.has_pose:
@@ -582,10 +596,10 @@ def posed_images(model: Any, views: Collection[str] = ()) -> dict[str, list[Any]
 
 
 def view_of_name(name: str, views: Collection[str] = ()) -> str:
-    """Return the view of a picture's name in a pose file: the name without folders and suffix.
+    """Return the view of a picture's name in a pose file. It is the name without folders and suffix.
 
-    A suffix has a letter: ``./train/r_0.5`` has none. A name of ``views`` stays as it is, because labels of Metashape
-    have no suffix.
+    A suffix contains a letter, so the name ``./train/r_0.5`` has no suffix. If the whole name is in ``views``, it is
+    returned unchanged, because labels of Metashape have no suffix.
     """
     path = PurePosixPath(canonical(name).replace("\\", "/"))
     if path.name in views:
@@ -600,10 +614,10 @@ def is_pinhole(camera: Any) -> bool:
 
 
 def require_sound(where: object, image: Any, camera: Any, tolerance: float) -> None:
-    """Check pose and lens of pycolmap's image and camera.
+    """Check the pose of an image and the parameters of its camera, both of pycolmap.
 
-    Numbers must be finite and at most ``FARTHEST``, also in single precision. The quaternion must have length 1 within
-    ``tolerance``.
+    Numbers must be finite and at most ``FARTHEST``, also in single precision. The length of the quaternion may differ
+    from 1 by at most ``tolerance``.
 
     Raises:
         PolarguideError: a number is invalid.
@@ -658,7 +672,12 @@ def _camera_of(folder: Path, image: Any, camera: Any) -> Camera:
 
 
 def _points_of(model: Any) -> tuple[Tensor, Tensor, tuple[tuple[int, ...], ...], list[int]]:
-    """Return finite points, their colors, the ids of the images that observe them, and their ids."""
+    """Return the points of a model whose coordinates are finite.
+
+    Returns:
+        The positions [M, 3]; the colors [M, 3]; the ids of the images that observe each point; and the ids of the
+        points.
+    """
     numbered = sorted(model.points3D.items())
     points = [point for _, point in numbered]
     with np.errstate(over="ignore"):
@@ -680,13 +699,13 @@ def _points_of(model: Any) -> tuple[Tensor, Tensor, tuple[tuple[int, ...], ...],
 
 
 _SAMPLES = 2000
-"""Number of points that are tested for visibility."""
+"""Largest number of points that are tested for visibility."""
 _MARGIN = 1.0
-"""Margin around a picture in its own sizes. In pictures of few points, no point may be inside."""
+"""Margin around a picture in which a point still counts as visible, relative to the size of the picture."""
 
 
 def unseen_points(points: Tensor, cameras: Sequence[Camera]) -> list[str]:
-    """Return a warning if no camera has one of the points [M, 3] in front of it. Large clouds are sampled."""
+    """Return a list with a warning if none of the points [M, 3] is visible in any camera. Large clouds are sampled."""
     if not cameras or not len(points):
         return []
     places = points[:: max(1, len(points) // _SAMPLES)].to(torch.float64)
@@ -699,7 +718,7 @@ def unseen_points(points: Tensor, cameras: Sequence[Camera]) -> list[str]:
 
 
 def _sees(camera: Camera, places: Tensor) -> bool:
-    """Return True if a point is in front of a camera, in its picture or the margin around it."""
+    """Return True if some point is in front of a camera, and inside its picture or the margin around it."""
     local = places @ camera.rotation.to(torch.float64).T + camera.translation.to(torch.float64)
     local = local[local[:, 2] > 0]
     x = camera.fx * local[:, 0] / local[:, 2] + camera.cx

@@ -1,4 +1,4 @@
-"""Poses of developed pictures: a COLMAP model matched by name, rescaled and undistorted."""
+"""Match the poses of a COLMAP model with the views of a capture, and undistort the pictures."""
 
 from __future__ import annotations
 
@@ -33,7 +33,9 @@ from polarguide.core.text import listed
 
 @dataclass(frozen=True)
 class Geometry:
-    """Crop and scale of a developed picture: developed = (stored - crop) / step, in pixels from the corner.
+    """Crop and scale between a stored picture and the developed picture.
+
+    Coordinates in pixels from the top-left corner are related by ``developed = (stored - crop) / step``.
 
     Attributes:
         stored: width and height of the stored picture.
@@ -50,12 +52,12 @@ class Geometry:
 
 @dataclass(frozen=True, eq=False)
 class Undistortion:
-    """Map from the pixels of a pinhole camera to those of a picture.
+    """Resampling of a distorted picture to the pixels of a pinhole camera.
 
     Attributes:
-        source: camera of the developed picture, as pycolmap's type.
-        target: pinhole camera.
-        moves: False for the identity.
+        source: camera of the developed picture with its distortion, as pycolmap's type.
+        target: pinhole camera of the resampled picture.
+        moves: True if the resampling changes the picture, False without distortion.
     """
 
     source: Any
@@ -63,7 +65,7 @@ class Undistortion:
     moves: bool
 
     def record(self) -> dict[str, Any] | None:
-        """Return the distorted camera model for ``scene.json``; None without distortion."""
+        """Return the distorted camera model as an entry of ``scene.json``. Return None if there is no distortion."""
         if not self.moves:
             return None
         return {"model": self.source.model_name, "parameters": [float(value) for value in self.source.params]}
@@ -78,7 +80,10 @@ class Undistortion:
     def apply(
         self, intensities: NDArray[np.float32], invalid: NDArray[np.bool_]
     ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-        """Resample intensities [4, H, W, 3]. A pixel is invalid if it uses invalid or outside pixels."""
+        """Resample intensities [4, H, W, 3] and the mask of invalid pixels [H, W].
+
+        A resampled pixel is invalid if it depends on an invalid pixel or on a place outside the picture.
+        """
         if not self.moves:
             return intensities, invalid
         x, y = self._map
@@ -87,7 +92,7 @@ class Undistortion:
 
     @functools.cached_property
     def _map(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Source coordinates of the target's pixels in OpenCV's convention."""
+        """Coordinates x and y in the source picture for each target pixel, in OpenCV's convention."""
         rows, columns = np.mgrid[: self.target.height, : self.target.width]
         places = np.stack([columns.ravel() + 0.5, rows.ravel() + 0.5], axis=1)  # COLMAP's pixel centers
         rays = self.target.cam_from_img(places)
@@ -97,10 +102,11 @@ class Undistortion:
 
 
 def camera_for_picture(camera: Any, geometry: Geometry, where: str) -> Any:
-    """Return a COLMAP camera in pixels of the developed picture.
+    """Convert a COLMAP camera to the pixels of the developed picture.
 
     Raises:
-        PolarguideError: the size of the camera does not match stored, developed or resized pictures.
+        PolarguideError: the size of the camera is neither that of the stored picture, nor of the developed picture, nor
+            of a resized copy.
     """
     width, height = geometry.size
     size = (camera.width, camera.height)
@@ -135,11 +141,11 @@ def camera_for_picture(camera: Any, geometry: Geometry, where: str) -> Any:
 
 
 _LEAST_STEP = 1.5
-"""Smallest ratio of a resized picture. Undistortion crops pictures by less."""
+"""Smallest ratio of two sizes at which one picture counts as a resized copy. Undistortion crops pictures by less."""
 
 
 def _is_resized(size: tuple[int, int], other: tuple[int, int]) -> bool:
-    """Return True if two sizes differ by one factor, up to rounding of the smaller size."""
+    """Return True if width and height of two pictures have the same ratio, apart from rounding."""
     if size[0] * other[1] == size[1] * other[0]:
         return size[0] > 0
     small, large = sorted((size, other))
@@ -162,15 +168,17 @@ def undistortion(camera: Any) -> Undistortion:
 
 
 class Poses:
-    """COLMAP model and the views of a capture that it has poses of.
+    """Poses of a COLMAP model that were matched with the views of a capture.
 
     Attributes:
         views: names of the views with a pose.
         missing: names of the views without a pose.
-        folder, files: origin of the model.
-        assumed_sizes: views whose camera file states no size; their cameras have the size of the pictures.
-        held_out: held-out views of the model's origin.
-        notes, warnings: messages about the origin.
+        folder: folder of the model.
+        files: files from which the model was read.
+        assumed_sizes: views whose camera file states no size. Their cameras get the size of the pictures.
+        held_out: held-out views that the pose files define.
+        notes: notes for the user about the source of the poses.
+        warnings: warnings for the user about the source of the poses.
     """
 
     assumed_sizes: frozenset[str] = frozenset()
@@ -183,9 +191,9 @@ class Poses:
 
         Args:
             model: pycolmap's ``Reconstruction``.
-            where: origin of the model for messages.
-            views: view names of the capture.
-            files: files that the model was read from.
+            where: source of the model for messages.
+            views: names of the views of the capture.
+            files: files from which the model was read.
 
         Raises:
             PolarguideError: no image belongs to a view, two images belong to one view, or a pose or camera is invalid.
@@ -220,10 +228,12 @@ class Poses:
 
     @classmethod
     def read(cls, path: Path, views: list[str]) -> Poses:
-        """Read a model from a folder with its files, ``sparse/0`` or ``sparse``. Points are optional.
+        """Read a COLMAP model and match it with views. The model may have no points.
+
+        The files of the model are in ``path``, or in its subfolder ``sparse/0`` or ``sparse``.
 
         Raises:
-            PolarguideError: there is no readable model, or the class rejects it.
+            PolarguideError: no model can be read, or it does not match the views.
         """
         folder, kind = find_model(path, points=False)
         files = [folder / (name + kind) for name in MODEL_FILES]
@@ -236,11 +246,15 @@ class Poses:
     def of_cameras(
         cls, cameras: Mapping[str, PosedCamera], where: Path, views: list[str], files: Sequence[Path] = ()
     ) -> Poses:
-        """Create a model without points from cameras by view name; ``where`` is their origin for messages."""
+        """Create poses without points from cameras by view name. ``where`` names their source in messages."""
         return cls(posed_model(cameras), where, views, files)
 
     def others(self) -> list[tuple[Path, int]]:
-        """List the models next to this one, such as ``sparse/1``, with the number of views that they have poses of."""
+        """List the other models in the same folder, such as ``sparse/1``.
+
+        Returns:
+            The folder of each model, and the number of views for which it has a pose.
+        """
         names = {*self.views, *self.missing}
         counts = []
         for folder in sorted(self.folder.parent.glob("[0-9]*")) if self.folder.name.isdigit() else []:
@@ -258,17 +272,17 @@ class Poses:
         return len(self._model.points3D)
 
     def stated_size(self, view: str) -> tuple[int, int] | None:
-        """Return width and height of a view's camera; None if its file states no size."""
+        """Return the width and height of a view's camera. Return None if the camera file states no size."""
         camera = self._model.cameras[self._images[view].camera_id]
         size = int(camera.width), int(camera.height)
         middle = (camera.principal_point_x, camera.principal_point_y) == (size[0] / 2, size[1] / 2)
         return None if view in self.assumed_sizes and middle else size
 
     def developed(self, geometries: Mapping[str, Geometry]) -> dict[str, PosedCamera]:
-        """Return the cameras of the developed pictures by view, with distortion.
+        """Return the cameras of the developed pictures by view, including their distortion.
 
         Raises:
-            PolarguideError: ``warp`` rejects a camera.
+            PolarguideError: the size of a camera does not match the pictures, see ``warp``.
         """
         cameras = {}
         for view in self.views:
@@ -289,7 +303,7 @@ class Poses:
         """Return the undistortion of a view's picture.
 
         Raises:
-            PolarguideError: the camera does not have the stored or developed size, or a multiple of it.
+            PolarguideError: the size of the camera matches neither the stored nor the developed picture.
         """
         number = self._images[view].camera_id
         key = (number, geometry)
@@ -307,7 +321,10 @@ class Poses:
         return warp
 
     def write(self, folder: Path) -> None:
-        """Write the model of the developed pictures as binary files, after ``warp`` was called for every view."""
+        """Write the COLMAP model of the undistorted pictures as binary files.
+
+        ``warp`` must have been called for every view.
+        """
         model = copy.deepcopy(self._model)
         for image in model.images.values():
             if image.camera_id in self._of_camera and len(image.points2D):

@@ -61,13 +61,14 @@ def match_features(
         reporter: reporter of the progress.
         cameras: known intrinsics by view.
         lenses: lenses by view from EXIF; views of one lens share their intrinsics.
-        masks: folder of ``<view>.png``. Features are extracted in white parts only, or everywhere without a file.
+        masks: folder of masks ``<view>.png``, or None. Features are extracted in the white parts of a mask, or in the
+            whole picture if the view has no mask.
 
     Returns:
-        Ids of image and camera in the database by view; empty without ``cameras``.
+        The ids of the image and the camera in the database by view. The result is empty without ``cameras``.
 
     Raises:
-        PolarguideError: COLMAP failed. The database is removed because it may be the cause.
+        PolarguideError: COLMAP failed. The database is removed because it may have caused the failure.
     """
     groups = _group_by_camera(sizes, cameras, lenses)
     count = len(sizes)
@@ -109,9 +110,9 @@ def _group_by_camera(
     cameras: Mapping[str, PosedCamera] | None,
     lenses: Mapping[str, Lens] | None = None,
 ) -> list[list[str]]:
-    """Group the views that share their intrinsics: those with equal lens and size.
+    """Group the views that share their intrinsics, because their lens and picture size are equal.
 
-    Each view is a group of its own if the known intrinsics differ.
+    If the known intrinsics differ, each view is a group of its own.
     """
     if cameras is not None and len({camera.intrinsics for camera in cameras.values()}) > 1:
         return [[view] for view in sizes]
@@ -138,7 +139,10 @@ def _scale_focal_lengths(database: Path, groups: Sequence[Sequence[str]], lenses
 
 
 def _copy_masks(masks: Path, sizes: Mapping[str, tuple[int, int]]) -> Path:
-    """Copy masks to the name ``<view>.png.png`` of COLMAP, which skips views without a mask: theirs are white."""
+    """Copy masks to the names ``<view>.png.png``, which COLMAP requires.
+
+    A view without a mask gets a white mask, because COLMAP skips pictures without a mask.
+    """
     folder = masks.with_name("colmap_masks")
     make_folder(folder)
     for view, (width, height) in sizes.items():
@@ -153,7 +157,10 @@ def _copy_masks(masks: Path, sizes: Mapping[str, tuple[int, int]]) -> Path:
 
 
 def _write_intrinsics(database: Path, cameras: Mapping[str, PosedCamera]) -> dict[str, tuple[int, int]]:
-    """Replace COLMAP's initial intrinsics by known ones and return the ids of image and camera by view."""
+    """Replace COLMAP's initial intrinsics by known intrinsics.
+
+    Return the ids of the image and the camera in the database by view.
+    """
     numbers = {}
     with pycolmap.Database.open(database) as link:
         for view, camera in cameras.items():
@@ -182,7 +189,7 @@ def run_step(
         reporter: reporter of the progress.
         label: name of the step for the user.
         total: number of units of work, if known.
-        done: function that counts finished units; default: the step reports them.
+        done: function that returns the number of finished units. By default, the step reports this number.
 
     Returns:
         Return value of the step.
@@ -329,9 +336,9 @@ def reconstruct(
 ) -> Path:
     """Estimate poses, intrinsics and points from ``folder/images/<view>.png``.
 
-    With a mask ``folder/masks/<view>.png``, features come from its white parts only. A database keeps features and
-    matches for an interrupted run. If less than nine tenths of the views are registered, mapping is repeated with half
-    as many matches. The largest model is used.
+    If a view has a mask ``folder/masks/<view>.png``, features are extracted in its white parts only. Features and
+    matches are stored in a database, so an interrupted run can be resumed. If fewer than nine tenths of the views are
+    registered, mapping is repeated with a smaller required number of matches. The largest model is used.
 
     Args:
         folder: folder of the pictures, the database and the model.
@@ -339,8 +346,8 @@ def reconstruct(
         matching: "exhaustive", or "sequential" for views taken in the order of their names.
         seed: seed of the random numbers.
         reporter: reporter of progress and messages.
-        untried: options that may connect more views, for messages.
-        intrinsics: known model and parameters of all pictures.
+        untried: options that may connect more views, which an error message suggests.
+        intrinsics: known camera model and parameters of all pictures, or None.
         refine: if True, known intrinsics are refined.
         lenses: lenses by view from EXIF.
 
@@ -443,13 +450,13 @@ def _map(
 
 
 _ROUNDS = 4
-"""Number of times that the sampled box shrinks."""
+"""Number of times that the sampled box shrinks to the accepted points."""
 _BATCH = 100_000
 """Number of samples per batch."""
 _SHARE_OF_VIEWS = 0.8
-"""Share of the cameras that must see a point."""
+"""Share of the cameras in which a point must be visible."""
 _SHARE_IN_MASKS = 0.95
-"""Share of these cameras whose mask must contain the point."""
+"""Share of the cameras that see a point in which the point must be inside the mask."""
 _BATCHES = 40
 """Largest number of batches of samples."""
 
@@ -464,9 +471,10 @@ def sample_visual_hull(
 ) -> Points:
     """Sample random points in the common field of view of most cameras, inside the foreground masks.
 
-    A point counts if 80 % of the cameras see it, and 95 % of these inside their mask. If there are masks, only cameras
-    with a mask count. The sampled box starts around the point nearest to all optical axes. Half of its side is the
-    median distance of the cameras from this point. The box shrinks to the points that count.
+    A point is accepted if it is visible in 80 % of the cameras, and inside the mask in 95 % of the cameras that see it.
+    If there are masks, cameras without a mask are ignored. The first sampled box is centered at the point nearest to
+    all optical axes. Half of its side is the median distance of the cameras from this point. The box then shrinks to
+    the accepted points.
 
     Args:
         cameras: cameras by view, with distortion.
@@ -475,7 +483,7 @@ def sample_visual_hull(
         rng: random generator.
 
     Returns:
-        [N, 3] with N up to ``count``; empty if no point is visible in enough cameras.
+        Points [N, 3], where N is at most ``count``. The array is empty if no point is accepted.
     """
     used = {view: camera for view, camera in cameras.items() if not masks or view in masks}
     pixels = {view: colmap_camera(camera) for view, camera in used.items()}
@@ -501,7 +509,11 @@ def sample_visual_hull(
 
 
 def _nearest_to_axes(cameras: list[PosedCamera]) -> tuple[Points, float]:
-    """Return the least-squares point nearest to all optical axes, and the cameras' median distance from it."""
+    """Find the point nearest to all optical axes by least squares.
+
+    Returns:
+        The point [3], and the median distance of the cameras from it.
+    """
     centers = np.stack([camera.center for camera in cameras])
     axes = np.stack([camera.rotation[2] for camera in cameras])
     across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
@@ -519,7 +531,7 @@ def _visible_to_most(
     pixels: Mapping[str, pycolmap.Camera],
     masks: Mapping[str, NDArray[np.bool_]],
 ) -> NDArray[np.bool_]:
-    """Return a mask [N] of the points [N, 3] that enough cameras see inside their masks."""
+    """Return a mask [N] of the points [N, 3] that are visible in enough cameras and inside enough masks."""
     counts = np.zeros(len(places))
     inside = np.zeros(len(places))
     for view, camera in cameras.items():
@@ -537,7 +549,7 @@ def _visible_to_most(
 
 
 FEWEST = 200
-"""Number of triangulated points below which points are sampled in the visual hull instead."""
+"""Smallest sufficient number of triangulated points. Otherwise, points are sampled in the visual hull."""
 SAMPLES = 20_000
 """Number of points that are sampled in the visual hull."""
 NOTE_FILE = "points.json"
@@ -553,22 +565,22 @@ def add_points(
     seed: int,
     reporter: Reporter,
 ) -> tuple[Path, dict[str, Any]]:
-    """Add 3D points to cameras without changing the cameras.
+    """Create 3D points for cameras with known poses, which do not change.
 
-    Features of ``folder/images/<view>.png`` are matched and triangulated with fixed poses. If fewer than ``FEWEST``
-    points result, points are sampled in the visual hull of ``folder/masks/<view>.png``, or in the common field of view
-    without masks.
+    Features of ``folder/images/<view>.png`` are matched, and points are triangulated. If there are fewer than
+    ``FEWEST`` points, points are sampled in the visual hull of the masks ``folder/masks/<view>.png`` instead. Without
+    masks, they are sampled in the common field of view of the cameras.
 
     Args:
-        folder: working folder; results of an earlier call are reused.
-        cameras: cameras of its pictures by view.
-        where: origin of the poses for messages.
+        folder: working folder. Results of an earlier call are reused.
+        cameras: cameras of the pictures by view.
+        where: source of the poses for messages.
         matching: "exhaustive" or "sequential".
         seed: seed of all random draws.
         reporter: reporter of progress and messages.
 
     Returns:
-        Folder of the model, and a record of the origin and number of its points.
+        The folder of the model; and a record of the source and the number of its points.
 
     Raises:
         PolarguideError: the cameras have no common field of view, or a file cannot be written.
@@ -610,7 +622,11 @@ def _triangulated(
     seed: int,
     reporter: Reporter,
 ) -> tuple[int, float | None]:
-    """Triangulate into ``trial`` and return the number of points with their mean reprojection error."""
+    """Triangulate points, and write the model to the folder ``trial``.
+
+    Returns:
+        The number of points; and their mean reprojection error in pixels, or None without points.
+    """
     database = folder / "database.db"
     images = folder / "images"
     sizes = {view: (camera.width, camera.height) for view, camera in cameras.items()}
@@ -673,7 +689,7 @@ def _sample(
 def _colors(
     folder: Path, cameras: Mapping[str, PosedCamera], places: NDArray[np.float64]
 ) -> NDArray[np.uint8]:
-    """Return the mean color of the photographs at the projections of points [N, 3], [N, 3] RGB."""
+    """Return the color of each point [N, 3] as RGB, [N, 3]. It is the mean over the photographs that show the point."""
     total = np.zeros((len(places), 3))
     counts = np.zeros(len(places))
     views = sorted(cameras)

@@ -1,8 +1,9 @@
 """Run one step of COLMAP as a separate process, which can be terminated at any time.
 
-Standard input has a line of JSON, ``{"step": name, "seed": number, "arguments": {...}}``. Standard output has lines of
-JSON: numbers of finished units, then ``{"value": ...}`` or ``{"error": text}``. The process ends with its parent, when
-standard input is closed. It imports no other module of polarguide, so it starts quickly.
+The process reads a line of JSON from standard input, ``{"step": name, "seed": number, "arguments": {...}}``. It writes
+lines of JSON to standard output: numbers of finished units, and finally ``{"value": ...}`` or ``{"error": text}``. The
+process ends when its standard input is closed, which also happens if its parent ends. It imports no other module of
+polarguide, so it starts quickly.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ import pycolmap
 # Log level of COLMAP. Failures raise exceptions.
 _FATAL = 3
 LEAST_VIEWS = 3
-"""Number of views of the smallest model."""
+"""Smallest number of views in a model."""
 _WEAK_PAIR = 10
 _WEAK_START = 50
 _WEAK_POSE = 15
@@ -32,7 +33,7 @@ Report = Callable[[int], None]
 
 
 def set_seed(options: Any, seed: int) -> None:
-    """Set the seed of COLMAP's options if this version has one."""
+    """Set the random seed in COLMAP's options, if the installed version supports it."""
     if hasattr(options, "random_seed"):
         options.random_seed = seed
 
@@ -53,7 +54,7 @@ def extract(
     groups: Sequence[Sequence[str]],
     masks: str | None,
 ) -> None:
-    """Extract the features of all pictures, with one camera for each group of names."""
+    """Extract the features of all pictures. The pictures of each group in ``groups`` share a camera."""
     reading: dict[str, Any] = {}
     if masks is not None:
         reading["reader_options"] = pycolmap.ImageReaderOptions()
@@ -85,10 +86,10 @@ def place(
         report: callback for the number of registered pictures.
         database: path of the database.
         images: folder of the pictures.
-        models: folder of the results. The folder of a model has its number as name.
+        models: folder of the results. The name of a model's folder is its number.
         free: if True, intrinsics are estimated.
-        weak: if True, half of COLMAP's default number of matches suffices. Small pictures have few matches, and so have
-            reflections that change behind a filter.
+        weak: if True, half of COLMAP's default number of matches is sufficient. This helps for small pictures and for
+            reflections that change behind a filter, which have few matches.
 
     Returns:
         Numbers of the models.

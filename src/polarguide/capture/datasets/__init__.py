@@ -1,1 +1,1 @@
-"""Published polarization datasets: layouts, cameras, and the sense of their angles."""
+"""Readers of published polarization datasets."""

@@ -1,4 +1,4 @@
-"""Common interface of published datasets, with cameras in COLMAP's conventions."""
+"""Common interface of published datasets, and functions for their readers. Cameras follow COLMAP's conventions."""
 
 from __future__ import annotations
 
@@ -32,13 +32,17 @@ from polarguide.core.errors import PolarguideError, PolarguideWarning, require
 from polarguide.core.text import listed
 
 StokesImage = tuple[NDArray[np.float32], NDArray[np.bool_]]
-"""Stokes vectors in the dataset's own sense of angles [3, H, W, 3], and a mask of clipped pixels [H, W]."""
+"""Stokes vectors [3, H, W, 3] and a mask of the clipped pixels [H, W].
+
+The angles of the Stokes vectors increase in the direction that the dataset uses, see ``Dataset.sense``.
+"""
 
 
 def read_mask(path: Path) -> NDArray[np.bool_]:
-    """Read a foreground mask [H, W] from a picture: pixels of at least half its maximum.
+    """Read a foreground mask [H, W] from a picture.
 
-    In a picture with transparent pixels, the mask has the pixels that are at least half opaque.
+    A pixel is foreground if its value is at least half of the largest value. In a picture with transparent pixels, a
+    pixel is foreground if it is at least half opaque.
     """
     data = read_picture(path)
     pixels = decode_stored(path, data)
@@ -52,21 +56,21 @@ def read_mask(path: Path) -> NDArray[np.bool_]:
 
 @dataclass(frozen=True, eq=False)
 class Dataset:
-    """Views, cameras and masks of a published dataset.
+    """Views, cameras and masks of a published dataset, and functions that read its pictures.
 
     Attributes:
-        name: "pandora", "pisr", ...
-        views: view names, sorted.
-        paths: all files that are read.
-        files: a file of each view whose header has the size of the view's picture.
-        cameras: cameras by view; None if the folder has no cameras.
+        name: name of the dataset, a key of ``DATASETS``.
+        views: names of the views, sorted.
+        paths: paths of all files that are read.
+        files: one file of each view. Its header states the size of the view's pictures.
+        cameras: camera of each view; None if the folder has no cameras.
         read_stokes: function that reads the Stokes vectors of a view; None for a dataset of raw mosaics.
-        masks: files of foreground masks by view; some views may have no mask.
-        read_mask: function that reads such a file, [H, W].
-        sense: direction in which angles increase as displayed, "ccw" or "cw".
-        sense_known: True if the release and the programs that read it agree on the sense.
-        mosaics: folder of raw mosaics, or None.
-        gamma: exponent of the mosaics' stored values: stored = linear ^ gamma.
+        masks: file of the foreground mask by view; some views may have no mask.
+        read_mask: function that reads a file in ``masks`` as a mask [H, W].
+        sense: direction in which the angles increase as displayed, "ccw" or "cw".
+        sense_known: True if the publication of the dataset and the programs that read it agree on the sense.
+        mosaics: folder of the raw mosaics, or None for a dataset of Stokes vectors.
+        gamma: exponent of the values in raw mosaics: stored = linear ^ gamma.
         notes: messages for the user.
     """
 
@@ -86,14 +90,14 @@ class Dataset:
 
 
 def masks_beside(root: Path, views: Mapping[str, int]) -> dict[str, Path]:
-    """Find the foreground masks by view: the pictures in ``mask/`` or ``masks/`` with the names of the views.
+    """Find the foreground masks in ``mask/`` or ``masks/``, and return them by view.
 
-    Names may be numbers with other leading zeros if each view has such a mask. The user is warned if only some of the
-    views have a mask.
+    A mask has the name of its view. Numbers may have a different number of leading zeros, such as ``7.png`` for the
+    view 007, if every view has a mask. The user gets a warning if only some of the views have a mask.
 
     Args:
         root: folder of the dataset.
-        views: numbers of the views by name.
+        views: number of each view by name.
     """
     pictures = index_files(root / "mask", SUFFIXES) or index_files(root / "masks", SUFFIXES)
     masks = {view: pictures[view] for view in views if view in pictures}
@@ -108,24 +112,24 @@ def masks_beside(root: Path, views: Mapping[str, int]) -> dict[str, Path]:
 
 
 def not_as_published(where: object, expected: str, found: str) -> PolarguideError:
-    """Return the error of a file that differs from the published dataset."""
+    """Return the error for a file that differs from the published dataset."""
     return PolarguideError(
         where, expected=expected, found=found, remedy="Use the files of the dataset as they were published."
     )
 
 
 def require_published(condition: object, where: object, expected: str, found: str) -> None:
-    """Check a condition on a file of a dataset.
+    """Raise an error if a file of a dataset does not meet a condition.
 
     Raises:
-        PolarguideError: the condition does not hold.
+        PolarguideError: the condition is false.
     """
     if not condition:
         raise not_as_published(where, expected, found)
 
 
 def _read_planes(paths: Sequence[Path]) -> NDArray[np.float32]:
-    """Read linear pictures of one size, [N, H, W, 3]."""
+    """Read linear pictures that have the same size, [N, H, W, 3]."""
     planes = [read_radiance(path) for path in paths]
     for path, plane in zip(paths, planes, strict=True):
         require_same_shape(path, plane.shape, planes[0].shape, paths[0])
@@ -147,15 +151,23 @@ def stokes_dataset(
     sense_known: bool = True,
     notes: tuple[str, ...] = (),
 ) -> Dataset:
-    """Create a dataset whose Stokes vectors follow from the files of a view.
+    """Create a dataset that stores the Stokes vectors of a view in several files.
 
     Args:
-        name, cameras, masks, read_mask, sense, sense_known, notes: attributes of ``Dataset``.
+        name: see ``Dataset``.
         parts: names of the files of a view for messages.
-        files: files by view, one for each part.
-        cameras_file: file of the cameras, if there is one.
-        read: function that reads the files of a view as three pictures [3, H, W, 3]; default: one linear picture each.
-        stokes: function that converts these pictures to Stokes vectors [3, H, W, 3]; default: they are Stokes vectors.
+        files: files of each view, one for each part.
+        cameras_file: file of the cameras, or None.
+        cameras: see ``Dataset``.
+        masks: see ``Dataset``.
+        read: function that reads the files of a view as three pictures [3, H, W, 3]. By default, each file is a linear
+            picture.
+        stokes: function that converts the three pictures to Stokes vectors [3, H, W, 3]. By default, the pictures are
+            the Stokes components.
+        read_mask: see ``Dataset``.
+        sense: see ``Dataset``.
+        sense_known: see ``Dataset``.
+        notes: see ``Dataset``.
 
     Raises:
         PolarguideError: a file is missing.
@@ -190,7 +202,7 @@ def require_files(files: Mapping[str, Path], kind: str) -> None:
     """Check that files exist.
 
     Raises:
-        PolarguideError: one is missing.
+        PolarguideError: a file is missing.
     """
     for view, path in files.items():
         require(
@@ -205,13 +217,13 @@ def require_files(files: Mapping[str, Path], kind: str) -> None:
 def cameras_of_views(
     path: Path, numbers: Mapping[str, int], cameras: Mapping[int, PosedCamera], entry: str
 ) -> dict[str, PosedCamera]:
-    """Return the cameras by view name.
+    """Return the camera of each view by name.
 
     Args:
-        path: camera file for messages.
-        numbers: number of each view's camera.
+        path: file of the cameras for messages.
+        numbers: number of the camera by view name.
         cameras: cameras by number.
-        entry: name of an entry of the file without its number.
+        entry: name of an entry of the file without the number, for messages.
 
     Raises:
         PolarguideError: a view has no camera.
@@ -237,12 +249,12 @@ def require_same_shape(path: Path, shape: tuple[int, ...], first: tuple[int, ...
 
 
 def numbered_views(stems: set[str]) -> dict[str, int]:
-    """Return the numbers of views whose names are numbers."""
+    """Return the number of each view by name, for the names that are numbers."""
     return {stem: int(stem) for stem in sorted(stems) if stem.isascii() and stem.isdigit() and len(stem) < 7}
 
 
 def first_picture_size(pictures: Mapping[str, Path], folder: Path) -> tuple[int, int]:
-    """Return width and height of the first picture, to which the intrinsics refer.
+    """Return the width and height of the first picture. The intrinsics of the cameras refer to this size.
 
     Raises:
         PolarguideError: there are no pictures, or the first one is damaged.
@@ -254,9 +266,9 @@ def first_picture_size(pictures: Mapping[str, Path], folder: Path) -> tuple[int,
 
 
 def resized_mask(dataset: Dataset, view: str, size: tuple[int, int]) -> NDArray[np.bool_] | None:
-    """Return the foreground mask of a view at a picture size (height, width); None without a mask.
+    """Return the foreground mask of a view, resized to a height and width. Return None if the view has no mask.
 
-    In a resized mask, a pixel is foreground if at least half of it is.
+    A pixel of the result is foreground if at least half of its area is foreground in the file.
 
     Raises:
         PolarguideError: the mask has another aspect ratio.
@@ -278,21 +290,22 @@ def resized_mask(dataset: Dataset, view: str, size: tuple[int, int]) -> NDArray[
 
 
 _LARGEST_SKEW = 1e-3
-"""Largest skew of a pixel, relative to the focal length."""
-# Entries of IDR and related programs.
+"""Largest skew in an intrinsic matrix that is ignored, relative to the focal length."""
+# Names of the entries that IDR and related programs write.
 _IDR_ENTRY = re.compile(r"((world|scale|camera)_mat_(inv_)?|pose_mat_)\d{1,6}")
 POSE_SHAPES = ((3, 4), (4, 4))
-"""Shapes of a camera pose in files."""
+"""Shapes of the matrix of a camera pose that are accepted in files."""
 Matrix = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
 class Projections:
-    """Cameras of IDR.
+    """Cameras in a file of IDR.
 
     Attributes:
-        cameras: K [3, 3] with K[2, 2] = 1, world-to-camera rotation [3, 3] and translation [3] by number.
-        padded: True if numbers below 10 have a leading zero, like names of pictures.
+        cameras: three arrays of each camera by number: the intrinsic matrix K [3, 3] with K[2, 2] = 1, the rotation
+            [3, 3], and the translation [3]. Rotation and translation lead from the world to the camera.
+        padded: True if numbers below 10 have a leading zero in the file.
     """
 
     cameras: dict[int, tuple[Matrix, Matrix, Matrix]]
@@ -300,9 +313,10 @@ class Projections:
 
 
 def read_projections(path: Path) -> Projections:
-    """Read cameras from a file with ``world_mat_<i>`` and ``scale_mat_<i>`` (IDR): P = world_mat @ scale_mat.
+    """Read the cameras of a file in IDR's format, with the arrays ``world_mat_<i>`` and ``scale_mat_<i>``.
 
-    The world of the result is normalized: the object is in the unit sphere. Inverse matrices in the file are redundant.
+    The projection of camera i is ``world_mat_<i> @ scale_mat_<i>``. In its world, the object is inside the unit sphere.
+    The inverse matrices in the file are redundant and not read.
 
     Raises:
         PolarguideError: the file has no camera, a matrix is invalid, two cameras have one number, or the matrices
@@ -351,7 +365,7 @@ def _is_identity(matrix: NDArray[Any]) -> bool:
 
 
 def require_known_names(path: Path, unknown: Iterable[str]) -> None:
-    """Warn about unknown fields of a camera file, if there are any."""
+    """Log a warning if a camera file has unknown fields."""
     names = sorted(unknown)
     if names:
         warnings.warn(
@@ -362,7 +376,7 @@ def require_known_names(path: Path, unknown: Iterable[str]) -> None:
 
 
 def decompose_projection(where: object, projection: Matrix) -> tuple[Matrix, Matrix, Matrix]:
-    """Decompose a 3x4 matrix s K [R | t] of any scale s into K, R and t.
+    """Decompose a 3x4 projection matrix ``s K [R | t]`` with an unknown scale s into K, R and t.
 
     Raises:
         PolarguideError: the matrix is singular, or its pixels are skewed.
@@ -382,7 +396,7 @@ def decompose_projection(where: object, projection: Matrix) -> tuple[Matrix, Mat
 
 
 def checked_intrinsics(where: object, matrix: object) -> Matrix:
-    """Check an intrinsic matrix, which may be padded to 3x4 or 4x4, and return its [3, 3] part.
+    """Check an intrinsic matrix of shape 3x3, 3x4 or 4x4, and return its 3x3 part.
 
     Raises:
         PolarguideError: the shape is invalid, focal lengths are not positive, or pixels are skewed.
@@ -400,10 +414,12 @@ def checked_intrinsics(where: object, matrix: object) -> Matrix:
 
 
 def checked_pose(where: object, matrix: Matrix) -> tuple[Matrix, Matrix]:
-    """Return rotation and translation of a rigid [3 or 4, 4] matrix, with an exactly orthogonal rotation.
+    """Return the rotation and the translation of a 3x4 or 4x4 matrix.
+
+    Rounding errors are removed, so the rotation is exactly orthogonal.
 
     Raises:
-        PolarguideError: the matrix is not rigid.
+        PolarguideError: the matrix is not a rigid transformation.
     """
     u, spread, vt = np.linalg.svd(matrix[:3, :3])
     if not (np.abs(spread - 1) < 1e-2).all() or np.linalg.det(u @ vt) < 0:
@@ -416,7 +432,14 @@ def checked_pose(where: object, matrix: Matrix) -> tuple[Matrix, Matrix]:
 def pinhole_camera(
     size: tuple[int, int], inner: Matrix, rotation: Matrix, translation: Matrix
 ) -> PosedCamera:
-    """Create a camera without distortion; ``inner`` is the intrinsic matrix in COLMAP's pixels."""
+    """Create a camera without distortion.
+
+    Args:
+        size: width and height.
+        inner: intrinsic matrix in COLMAP's convention, in which pixel centers are at 0.5.
+        rotation: rotation from the world to the camera, [3, 3].
+        translation: translation from the world to the camera, [3].
+    """
     parameters = (inner[0, 0], inner[1, 1], inner[0, 2], inner[1, 2])
     return PosedCamera(*size, "PINHOLE", tuple(float(p) for p in parameters), rotation, translation)
 
@@ -424,12 +447,13 @@ def pinhole_camera(
 def distorted_camera(
     where: object, size: tuple[int, int], inner: Matrix, coefficients: Any, pose: Sequence[Matrix]
 ) -> PosedCamera:
-    """Create a camera from OpenCV's calibration with 4, 5 or 8 distortion coefficients.
+    """Create a camera from a calibration by OpenCV with 4, 5 or 8 distortion coefficients.
 
-    OpenCV's origin is the center of the top-left pixel, COLMAP's its corner. The principal point moves by half a pixel.
+    The origin of pixel coordinates is the center of the top-left pixel in OpenCV, and its corner in COLMAP. The
+    principal point is therefore moved by half a pixel.
 
     Raises:
-        PolarguideError: the number of coefficients differs.
+        PolarguideError: the number of coefficients is not 4, 5 or 8.
     """
     k = finite_numbers(where, np.ravel(np.asarray(coefficients)), ((4,), (5,), (8,)))
     parameters = (
@@ -444,10 +468,10 @@ def distorted_camera(
 
 
 def require_entries(path: Path, entries: Mapping[str, object], *keys: str) -> None:
-    """Check that a file has entries.
+    """Check that a file has at least one entry.
 
     Raises:
-        PolarguideError: an entry is missing.
+        PolarguideError: the file has no entry.
     """
     for key in keys:
         require_published(key in entries, path, f"the entry {key}", listed(sorted(entries)) or "no entry")

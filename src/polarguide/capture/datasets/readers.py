@@ -59,7 +59,7 @@ from polarguide.core.records import read_record
 from polarguide.core.text import number_or_nan
 
 STOKES_FOLDERS = ("images_stokes", "train_images_stokes")
-"""Folders of Stokes vectors in the releases and in the copies of NeRSP, PolGS and PhyGaP."""
+"""Folders with the Stokes vectors of PANDORA, in the original and in the copies of NeRSP, PolGS and PhyGaP."""
 _PICTURES = ("image", "images", "train", "I-sum", "I_sum")
 _MAPS = ("input_azimuth_maps", "train_input_azimuth_maps")
 _PANDORA_PARTS = ("s0", "s0p1", "s0p2")
@@ -67,7 +67,7 @@ _PANDORA_STEM = re.compile(r"(?P<view>\d{1,6})_(?P<part>s0|s0p1|s0p2)")
 
 
 def open_pandora(root: Path) -> Dataset:
-    """Open PANDORA, also as NeRSP and PolGS distribute it.
+    """Open the dataset PANDORA, or a copy of it that NeRSP or PolGS distribute.
 
     Raises:
         PolarguideError: a file is missing, or the cameras are invalid.
@@ -79,7 +79,7 @@ def open_pandora(root: Path) -> Dataset:
     files = {view: [folder / f"{view}_{part}.hdr" for part in _PANDORA_PARTS] for view in views}
     pictures = index_files(_first_path(root, _PICTURES), SUFFIXES)
     numbers = {view: int(view) for view in views}
-    # Files count from 1, unless a file or a picture has the name 00.
+    # The first view has the number 1, unless a file has the name 00.
     first = 0 if 0 in numbers.values() or "00" in pictures else 1
     cameras: dict[str, PosedCamera] | None = None
     notes: tuple[str, ...] = ()
@@ -98,7 +98,7 @@ def open_pandora(root: Path) -> Dataset:
 
 
 def _stokes_of_sums(planes: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Convert S0, S0 + S1 and S0 + S2 to Stokes vectors."""
+    """Convert the three pictures S0, S0 + S1 and S0 + S2 to Stokes vectors."""
     total, plus1, plus2 = planes
     return np.asarray(np.stack([total, plus1 - total, plus2 - total]) / np.float32(2), np.float32)
 
@@ -109,7 +109,9 @@ _NERSP_CAMERAS = ("cameras.npz", "cameras_new.npz", "cameras_sphere.npz")
 
 
 def open_nersp(root: Path) -> Dataset:
-    """Open NeRSP (SMVP3D, and RMVP3D with an archive for each view), also as PolGS distributes it.
+    """Open the dataset NeRSP, or the copy of it that PolGS distributes.
+
+    NeRSP consists of SMVP3D, and of RMVP3D, which has one archive for each view.
 
     Raises:
         PolarguideError: a file is missing, or the cameras are invalid.
@@ -138,15 +140,15 @@ def open_nersp(root: Path) -> Dataset:
 
 
 def _halved(planes: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Convert Stokes vectors to the scale of S0 / 2."""
+    """Divide Stokes vectors by 2."""
     return planes / np.float32(2)
 
 
 def _read_archive(paths: Sequence[Path]) -> NDArray[np.float32]:
-    """Read Stokes vectors [3, H, W, 3] from the entries S0, S1 and S2 of an archive, RMVP3D's file of a view.
+    """Read the Stokes vectors of a view of RMVP3D, [3, H, W, 3], from the entries S0, S1 and S2 of its archive.
 
     Raises:
-        PolarguideError: the file cannot be read, lacks an entry, or its entries are no pictures of one size.
+        PolarguideError: the file cannot be read, an entry is missing, or the entries are not pictures of equal size.
     """
     (path,) = paths
     arrays = decode_arrays(path, read_file(path), _NERSP_ENTRIES, 3 * 8 * 3 * LARGEST_PIXELS, kinds="biufcSU")
@@ -164,7 +166,7 @@ def _read_archive(paths: Sequence[Path]) -> NDArray[np.float32]:
 
 
 def _first_path(root: Path, names: Sequence[str]) -> Path:
-    """Return the first existing path of several names, or that of the first name."""
+    """Return the path of the first name that exists in a folder. If no name exists, return the path of the first."""
     return next((root / name for name in names if (root / name).exists()), root / names[0])
 
 
@@ -176,19 +178,23 @@ def _cameras(
     light: Path | None,
     offsets: tuple[int, ...] | None,
 ) -> tuple[dict[str, PosedCamera], int]:
-    """Read the cameras by view, and the offset from a view's number to that of its camera.
+    """Read the camera of each view.
 
-    Numbers of cameras start at 0 (``world_mat_0``), or at 1 (``world_mat_01``) in the releases of PANDORA and the
-    copies of PolGS. The first number decides. An offset must give every view a camera, so that a removed camera does
-    not shift all others.
+    The numbers of the cameras start at 0 (``world_mat_0``), or at 1 (``world_mat_01``) in the original of PANDORA and
+    the copies of PolGS. The smallest number in the file decides which numbering applies. Every view must have a camera
+    with the chosen offset. A missing camera therefore causes an error and cannot shift all other cameras.
 
     Args:
         root: folder of the dataset.
         path: file of the cameras.
-        views: number of each view's files.
-        pictures: pictures of the intrinsics.
-        light: a file of Stokes vectors. The cameras have its size if the pictures were resized later.
-        offsets: possible offsets for files that count from 0; None for files that count from 1.
+        views: number of each view by name.
+        pictures: pictures to which the intrinsics refer, by name.
+        light: a file of Stokes vectors. If the pictures were resized later, the intrinsics refer to the size of this
+            file.
+        offsets: possible offsets if the numbers of the views start at 0; None if they start at 1.
+
+    Returns:
+        The cameras by view name; and the offset, which is the number of a camera minus the number of its view.
     """
     projections = read_projections(path)
     known = projections.cameras
@@ -211,12 +217,14 @@ def _cameras(
 
 
 def _camera_size(path: Path, inner: Sequence[NDArray[np.float64]], size: Size, light: Path | None) -> Size:
-    """Return the size that cameras refer to: of the pictures, or of the Stokes vectors if pictures were resized later.
+    """Return the width and height to which the intrinsics of cameras refer.
+
+    It is the size of the pictures, or the size of the Stokes vectors if the pictures were resized later.
 
     Args:
         path: file of the cameras for messages.
         inner: intrinsic matrices of the cameras.
-        size: size of the pictures.
+        size: width and height of the pictures.
         light: a file of Stokes vectors.
     """
     centers = [(float(matrix[0, 2]), float(matrix[1, 2])) for matrix in inner]
@@ -236,14 +244,18 @@ def _camera_size(path: Path, inner: Sequence[NDArray[np.float64]], size: Size, l
 def _masks(
     root: Path, views: Mapping[str, int], first: int
 ) -> tuple[dict[str, Path], Callable[[Path], NDArray[np.bool_]]]:
-    """Find the foreground masks by view, and the function that reads them.
+    """Find the foreground masks of the views.
 
-    They are in ``mask/`` or ``masks/``, else in the last channel of NeRSP's azimuth maps.
+    The masks are pictures in ``mask/`` or ``masks/``. If these folders do not exist, the last channels of NeRSP's
+    azimuth maps are used.
 
     Args:
         root: folder of the dataset.
-        views: numbers of the views by name.
-        first: first number of the files; maps count from 0.
+        views: number of each view by name.
+        first: number of the first view. The number of the first azimuth map is always 0.
+
+    Returns:
+        The file of the mask by view name, and the function that reads such a file.
     """
     maps = index_files(_first_path(root, _MAPS), (".png",))
     if not maps:
@@ -264,7 +276,7 @@ _NEISF_STEM = re.compile(r"img_(\d{1,6})")
 
 
 def open_neisf(root: Path) -> Dataset:
-    """Open NeISF.
+    """Open the dataset NeISF.
 
     Raises:
         PolarguideError: a file is missing, or the cameras are invalid.
@@ -282,7 +294,7 @@ def open_neisf(root: Path) -> Dataset:
 
 
 def _llff_cameras(path: Path) -> dict[int, PosedCamera]:
-    """Read the cameras of LLFF by row; rows count from 1 like the files."""
+    """Read the cameras of a file in LLFF's format. The key of a camera is the number of its row; the first row is 1."""
     rows = read_array(path)
     require_published(
         rows.ndim == 2 and rows.shape[1] == 17 and len(rows),
@@ -301,7 +313,7 @@ def _llff_cameras(path: Path) -> dict[int, PosedCamera]:
             "height, width and focal length in pixels",
             f"{height:g}, {width:g} and {focal:g}",
         )
-        # Axes of OpenCV: right, down, forward.
+        # The axes are converted to those of OpenCV: right, down, forward.
         axes = np.column_stack([np.stack([right, down, -back]), np.zeros(3)])
         rotation, _ = checked_pose(where, axes)
         middle = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
@@ -312,11 +324,11 @@ def _llff_cameras(path: Path) -> dict[int, PosedCamera]:
 
 
 def open_gnerp(root: Path, *, transfer: str) -> Dataset:
-    """Open GNeRP.
+    """Open the dataset GNeRP.
 
     Args:
         root: folder of the dataset.
-        transfer: encoding of the pictures: "linear", "srgb", or "auto" for "srgb".
+        transfer: encoding of the pictures, "linear" or "srgb". "auto" means "srgb".
 
     Raises:
         PolarguideError: a file is missing, or the cameras are invalid.
@@ -363,7 +375,7 @@ def open_gnerp(root: Path, *, transfer: str) -> Dataset:
 
 
 def _plane(path: Path, shape: tuple[int, ...], like: Path) -> NDArray[np.float32]:
-    """Read numbers [H, W] from a file with [H, W] or [H, W, 1]."""
+    """Read an array of shape [H, W] or [H, W, 1] from a file, and return it as [H, W]."""
     plane = read_array(path)
     if plane.ndim == 3 and plane.shape[2] == 1:
         plane = plane[..., 0]
@@ -381,7 +393,10 @@ _GNERP_ENTRY = re.compile(r"w2c_mat_\d{1,6}|intrinsic(_\d{1,6})?")
 
 
 def _gnerp_cameras(path: Path, size: tuple[int, int]) -> dict[int, PosedCamera]:
-    """Read cameras by number, from ``w2c_mat_<i>`` and ``intrinsic_<i>`` with ``intrinsic`` as default."""
+    """Read cameras by number from the arrays ``w2c_mat_<i>`` and ``intrinsic_<i>``.
+
+    The array ``intrinsic`` applies to cameras without intrinsics of their own.
+    """
     content: dict[str, Any] = read_record(path, dict[str, Any])
     cameras = {}
     for key, value in content.items():
@@ -401,12 +416,12 @@ def _gnerp_cameras(path: Path, size: tuple[int, int]) -> dict[int, PosedCamera]:
 
 PHYGAP_CAMERAS = "camera_params.npz"
 _PHYGAP_ENTRIES = {"intrinsics", "extrinsics", "image_width", "image_height", "fov"}
-"""Known entries. The angle of view is redundant."""
+"""Known entries of the camera file. The angle of view (``fov``) is redundant and not used."""
 _CHANNELS = tuple(f"S{part}.{color}" for part in range(3) for color in "RGB")
 
 
 def open_phygap(root: Path) -> Dataset:
-    """Open PhyGaP.
+    """Open the dataset PhyGaP.
 
     Raises:
         PolarguideError: a file is missing, or the cameras are invalid.
@@ -453,7 +468,10 @@ def open_phygap(root: Path) -> Dataset:
 
 
 def _read_mitsuba(paths: Sequence[Path]) -> NDArray[np.float32]:
-    """Read Stokes vectors [3, H, W, 3] of Mitsuba, whose angles start at the vertical of the picture."""
+    """Read the Stokes vectors of a view rendered by Mitsuba, [3, H, W, 3].
+
+    Mitsuba measures angles from the vertical of the picture. They are converted to angles from the horizontal.
+    """
     (path,) = paths
     s0, s1, s2 = np.split(read_exr(path, _CHANNELS), 3, axis=2)
     return np.stack([s0, -s1, -s2])
@@ -461,14 +479,14 @@ def _read_mitsuba(paths: Sequence[Path]) -> NDArray[np.float32]:
 
 PISR_SENSOR: Final = "IMX250MYR"
 _PISR_SIZE = (1224, 1024)
-"""Picture size of ``camera_matrix``."""
-# Known entries. Poses of the calibration target and the error are results of OpenCV that are not needed.
+"""Width and height of the pictures to which ``camera_matrix`` refers."""
+# Known entries of the camera file. The poses of the calibration target and the error of the calibration are not used.
 _PISR_ENTRIES = {"camera_matrix", "dist_coeffs", "rvecs", "tvecs", "ret", "rms"}
 _PISR_CAMERAS = ("cameras_sphere.npz", "cameras.npz")
 
 
 def open_pisr(root: Path) -> Dataset:
-    """Open PISR.
+    """Open the dataset PISR.
 
     Raises:
         PolarguideError: a file is missing, or the cameras are invalid.
@@ -505,7 +523,7 @@ def open_pisr(root: Path) -> Dataset:
 
 
 def _gamma(root: Path, files: Sequence[Path]) -> float:
-    """Return the number in the name of the gamma file; 1 without a file."""
+    """Return the gamma of the mosaics, which the name of a file states. Return 1 if the file does not exist."""
     if not files:
         return 1.0
     gamma = number_or_nan(files[0].name.removeprefix("gamma").removesuffix(".txt"))
@@ -526,14 +544,15 @@ DATASETS: dict[str, tuple[tuple[str, ...], Callable[..., Dataset]]] = {
     "phygap": ((PHYGAP_CAMERAS,), open_phygap),
     "pandora": ((), open_pandora),
 }
-"""Datasets by name: the files and folders of its layout, and the function that opens it.
+"""Layout and reader of each dataset by name.
 
-The files in ``images_stokes/`` tell PANDORA from RMVP3D.
+The layout is a tuple of files and folders that identify the dataset. The reader is the function that opens it. PANDORA
+and RMVP3D differ in the names of the files in ``images_stokes/``.
 """
 
 
 def detect_dataset(root: Path) -> str | None:
-    """Return the name of the dataset whose layout a folder has, or None."""
+    """Detect a dataset by the layout of a folder, and return its name. Return None for any other layout."""
     folder = _first_path(root, STOKES_FOLDERS)
     if folder.is_dir():
         return "nersp" if any(path.suffix.lower() == ".npz" for path in folder.iterdir()) else "pandora"

@@ -1,1 +1,1 @@
-"""A rotating polarizing filter in front of an ordinary camera: four shots per view."""
+"""Read and develop shots of an ordinary camera with a rotating polarizing filter in front of the lens."""

@@ -1,4 +1,4 @@
-"""Consecutive pictures: shots of one place through a filter, and frames of a video."""
+"""Find groups of consecutive pictures that show one place, and extract the frames of videos."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ from polarguide.geometry.polarizer import ANGLES
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 MOST_SHOTS = 12
-"""Largest number of shots of one place, one every 15 degrees over 180 degrees."""
+"""Largest number of shots of one place. It is sufficient for one shot every 15 degrees over 180 degrees."""
 _SAMPLED = 24
 _SIDE = 96
 _BLUR = 4.0
 _APART = 2.0
-"""Smallest ratio of the differences between groups and within groups."""
+"""Smallest ratio of the differences between pictures of different groups to those within a group."""
 
 
 def shots_of_one_place(paths: Sequence[Path]) -> int | None:
-    """Return the number of consecutive pictures that show one place; None without such groups.
+    """Return the number of consecutive pictures that show one place. Return None if there are no such groups.
 
     A rotating filter changes reflections but moves no edge. Consecutive pictures are therefore compared without low
     frequencies. Differences within groups must be much smaller than between groups. Only the first pictures are read.
@@ -54,9 +54,9 @@ def shots_of_one_place(paths: Sequence[Path]) -> int | None:
 
 
 def numbered_like_angles(paths: Sequence[Path]) -> list[Path]:
-    """Return the first pictures whose names differ only in a number, 0, 45, 90 and 135; empty without these.
+    """Return four pictures whose names differ only in one number, which is 0, 45, 90 or 135.
 
-    Examples are cup_P45.png, cup(45).png and 45_cup.png. Numbers that count pictures have other values.
+    Examples are cup_P45.png, cup(45).png and 45_cup.png. The result is empty if there are no such pictures.
     """
     groups: dict[tuple[Path, str, str], dict[int, Path]] = {}
     for path in paths:
@@ -79,22 +79,25 @@ def _edges(path: Path) -> NDArray[np.float32]:
 
 
 FRAMES_A_SECOND = 2.0
-"""Frames per second of a video. During a walk around a subject in a minute, the camera turns by 3 degrees per frame."""
+"""Number of frames per second of a video that are used.
+
+If the camera moves around a subject in a minute, it turns by 3 degrees between two of these frames.
+"""
 LEAST_FRAMES = 24
 MOST_FRAMES = 120
 _RECORD = "video.txt"
 
 
 def find_videos(root: Path) -> list[Path]:
-    """Return the videos in a folder, or the file itself if it is one."""
+    """Return the videos in a folder. If ``root`` is a video file, return it."""
     files = [root] if root.is_file() else sorted(root.iterdir()) if root.is_dir() else []
     return [path for path in files if path.is_file() and path.suffix.lower() in VIDEO_SUFFIXES]
 
 
 def extract_frames(video: Path, folder: Path, reporter: Reporter) -> int:
-    """Write the sharpest frame of each time interval of a video as PNG, upright; return the number of frames.
+    """Write the sharpest frame of each time interval of a video as a PNG file, and return the number of frames.
 
-    Frames of an earlier call with the same video are kept.
+    Frames are rotated for display. The files of an earlier call for the same video are reused.
 
     Raises:
         PolarguideError: OpenCV cannot read the video, or it has too few frames.
@@ -149,17 +152,21 @@ def _sharpness(picture: NDArray[np.uint8]) -> float:
 
 
 _MANY = 100
-"""Largest number of pictures of which all pairs are compared for any names, 4950 pairs."""
+"""Largest number of pictures whose pairs are all compared, even if their names are numbered: 4950 pairs."""
 _NUMBERED = re.compile(r"(?P<name>.*?)(?P<number>\d+)")
 _NEIGHBORS = 20
-"""Number of neighbors that COLMAP compares with each picture: the next ten, and some at powers of two."""
+"""Approximate number of pictures that COLMAP compares with each picture in sequential matching."""
 
 
 def chosen_matching(views: Sequence[str], matching: str, reporter: Reporter) -> str:
-    """Return "exhaustive" or "sequential"; tell the user about the choice of ``auto``, or about a faster alternative.
+    """Choose the matching of pictures, "exhaustive" or "sequential".
+
+    A message informs the user about the choice for ``auto``, or about a faster alternative.
 
     Args:
-        views: names in their order. matching: requested matching. reporter: for the message.
+        views: names of the views in their order.
+        matching: matching that the user requested.
+        reporter: reporter of the message.
     """
     if matching != "auto":
         return matching

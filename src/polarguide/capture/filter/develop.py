@@ -1,4 +1,4 @@
-"""Alignment of the shots of a view: estimation and correction of small shifts and rotations."""
+"""Estimate and correct small shifts and rotations between the shots of a view."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from polarguide.geometry.polarizer import ANGLES
 
 SMALLEST = 0.2
-"""Smallest shift in pixels that is corrected. Errors of the estimate have this size, and resampling blurs."""
+"""Smallest shift in pixels that is corrected. The estimate has errors of this size, and a correction blurs a shot."""
 LARGEST_SHARE = 0.05
 """Largest shift that is corrected, as a share of the picture's width."""
 
@@ -26,10 +26,11 @@ class Shift:
     """Displacement of a shot relative to the first.
 
     Attributes:
-        x, y: shift in pixels, right and down; with a ``warp``, that of the picture's center.
-        trusted: True for a reliable estimate.
-        warp: affine matrix [2, 3], row by row, from pixels of the first shot to this one; None without rotation. Unlike
-            elsewhere, the center of the first pixel is (0, 0).
+        x: shift to the right in pixels. If there is a ``warp``, it is the shift of the picture's center.
+        y: shift down in pixels, as ``x``.
+        trusted: True if the estimate is reliable.
+        warp: affine matrix [2, 3] from pixels of the first shot to pixels of this shot, row by row. It is None if the
+            shot is not rotated. The center of the first pixel is at (0, 0).
     """
 
     x: float
@@ -44,7 +45,7 @@ class Shift:
 
 
 AGREEING = 0.05
-"""Largest mean |I0 + I90 - I45 - I135| / S0 of aligned shots; ``inspect`` calls larger values inconsistent."""
+"""Largest mean of |I0 + I90 - I45 - I135| / S0 at which four shots count as aligned."""
 
 
 def estimate_shifts(linear: NDArray[np.float32]) -> list[Shift]:
@@ -82,7 +83,7 @@ def _aligned_disagreement(linear: NDArray[np.float32], shifts: Sequence[Shift]) 
 
 
 def _disagreement(linear: NDArray[np.float32], bad: NDArray[np.bool_]) -> float:
-    """Return the mean |I0 + I90 - I45 - I135| relative to S0, after removal of a common gain."""
+    """Return the mean of |I0 + I90 - I45 - I135| / S0, after the two pair sums were scaled to the same brightness."""
     i0, i45, i90, i135 = linear.mean(axis=3)[:, ~bad]
     first = i0 + i90
     second = i45 + i135
@@ -94,16 +95,16 @@ def _disagreement(linear: NDArray[np.float32], bad: NDArray[np.bool_]) -> float:
 def align_shots(
     linear: NDArray[np.float32], masks: Sequence[NDArray[np.bool_]], shifts: Sequence[Shift]
 ) -> tuple[NDArray[np.float32], list[NDArray[np.bool_]], NDArray[np.bool_]]:
-    """Align shots by their shifts.
+    """Resample shots so that all of them are aligned with the first shot.
 
     Args:
         linear: linear intensities [K, H, W, 3].
-        masks: masks of each shot, [K, H, W], or of all shots, [H, W].
-        shifts: shifts of the shots.
+        masks: masks for each shot, [K, H, W], or for all shots, [H, W].
+        shifts: shift of each shot.
 
     Returns:
-        The aligned intensities; for each mask the pixels that depend on a marked pixel of any shot, [H, W]; and the
-        pixels that depend on a place outside of a shot, [H, W].
+        The aligned intensities; for each of ``masks`` a mask [H, W] of the pixels that depend on a marked pixel of some
+        shot; and a mask [H, W] of the pixels that depend on a place outside a shot.
     """
     height, width = linear.shape[1:3]
     moved = linear.copy()
@@ -129,7 +130,10 @@ def align_shots(
 
 
 def remapped_mask(mask: NDArray[np.bool_], x: Any, y: Any) -> NDArray[np.bool_]:
-    """Resample a mask [H, W] at places ``x`` and ``y``: True if a marked pixel or a place outside has weight."""
+    """Resample a mask [H, W] at the coordinates ``x`` and ``y`` by bilinear interpolation.
+
+    A pixel of the result is True if its interpolation uses a marked pixel or a place outside the mask.
+    """
     weight = cv2.remap(
         mask.astype(np.float32), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=1.0
     )
@@ -137,7 +141,7 @@ def remapped_mask(mask: NDArray[np.bool_], x: Any, y: Any) -> NDArray[np.bool_]:
 
 
 def moved_shots(shifts: Sequence[Shift]) -> list[str]:
-    """Return the shots that were shifted back, with their shifts, as text."""
+    """Describe each shot whose shift was corrected, as text."""
     return [
         f"{angle} by ({-shift.x:+.2f}, {-shift.y:+.2f}){'' if shift.warp is None else ' and turned'}"
         for angle, shift in zip(ANGLES, shifts, strict=True)
@@ -146,7 +150,7 @@ def moved_shots(shifts: Sequence[Shift]) -> list[str]:
 
 
 def shift_notes(view: str, shifts: Sequence[Shift]) -> list[str]:
-    """Return notes about corrected shots, and about shots with an unreliable shift."""
+    """Return notes for the user about shots with a corrected shift, and about shots with an unreliable shift."""
     moved = moved_shots(shifts)
     doubtful = [str(angle) for angle, shift in zip(ANGLES, shifts, strict=True) if not shift.trusted]
     notes = [f"{view}: shots were shifted back, in pixels: {', '.join(moved)}."] if moved else []
@@ -196,9 +200,9 @@ _TURN_SIDE = 1024
 
 
 def _turn(reference: NDArray[np.float32], other: NDArray[np.float32], shift: Shift) -> Shift:
-    """Return shift and rotation of a shot, starting from its shift.
+    """Estimate the rotation of a shot in addition to its shift.
 
-    The shift is returned unchanged if the estimate does not converge, or if the rotation moves no corner.
+    The shift is returned unchanged if the estimate does not converge, or if the rotation is negligible.
     """
     height, width = reference.shape
     if min(height, width) < 2:

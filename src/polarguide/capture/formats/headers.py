@@ -1,7 +1,7 @@
 """Parse the structure of picture files, and check that they are complete.
 
-Decoders differ for truncated files: some refuse them, some return gray or old rows for the missing part. The check of
-the structure gives the same result for every decoder.
+Some decoders refuse truncated files, and others return gray or old rows for the missing part. The check of the
+structure gives the same result for every decoder.
 """
 
 from __future__ import annotations
@@ -34,38 +34,41 @@ _KINDS = re.compile(
     rb"|(?P<HEIF>.{4}ftyp(?:heic|heix|hevc|heim|heis|mif1|msf1|avif|avis))",
     re.DOTALL,
 )
-"""Kinds of picture files by their first bytes."""
+"""Pattern that recognizes kinds of picture files by their first bytes."""
 TIFFS = ("TIFF", "BigTIFF")
 # The end of JPEG scan data. In the data, 0xFF is followed by 0 (a stuffed byte) or by 0xD0-0xD7 (a restart).
 _JPEG_SCAN_END = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")
 ORIENTATION = 274
-# JPEG markers without a length: an unused one, and restarts.
+# JPEG markers that no length follows: an unused marker, and restarts.
 _JPEG_ALONE = (0x01, *range(0xD0, 0xD8))
-# Largest number of scans of a progressive JPEG file. Encoders write about ten; decoding an empty one costs as much.
+# Largest number of scans of a progressive JPEG file. Encoders write about ten. Even an empty scan takes time to decode.
 _MOST_SCANS = 200
 LARGEST_PIXELS = 150_000_000
-"""Upper bound of the pixels of a camera. Larger files are refused before memory is allocated."""
+"""Largest number of pixels of a picture. A larger picture is refused before memory is allocated."""
 
 
 def damaged(path: Path, expected: str, found: str) -> PolarguideError:
-    """Return the error of a file that cannot be decoded."""
+    """Return the error for a file that cannot be decoded."""
     return PolarguideError(path, expected=expected, found=found, remedy="Copy or export the file again.")
 
 
 def picture_kind(data: bytes) -> str:
-    """Return the kind of a picture file: PNG, JPEG, TIFF, BigTIFF, BMP, PNM, WebP, HEIF, or an empty text."""
+    """Return the kind of a picture file according to its first bytes: PNG, JPEG, TIFF, BigTIFF, BMP, PNM, WebP or HEIF.
+
+    Return an empty text for any other file.
+    """
     match = _KINDS.match(data)
     return "" if match is None else str(match.lastgroup)
 
 
 def find_damage(data: bytes) -> str | None:
-    """Describe the damage in the structure of a picture file, or return None.
+    """Describe the damage in the structure of a picture file. Return None if the structure is complete.
 
     Args:
         data: content of the file.
 
     Returns:
-        A noun phrase for the field ``found`` of an error: "an empty file", "a PNG file cut short", ...
+        A noun phrase for the field ``found`` of an error, such as "an empty file" or "a PNG file cut short".
     """
     kind = picture_kind(data)
     if kind:
@@ -74,7 +77,10 @@ def find_damage(data: bytes) -> str | None:
 
 
 def declared_size(data: bytes) -> tuple[int, int] | None:
-    """Return width and height in the header of a picture file; None if it is invalid or ambiguous for decoders."""
+    """Return the width and height in the header of a picture file.
+
+    Return None if the header is invalid, or if decoders interpret it differently.
+    """
     kind = picture_kind(data)
     if kind == "PNG":
         return struct.unpack_from(">II", data, 16) if data[12:16] == b"IHDR" and len(data) >= 24 else None
@@ -85,7 +91,7 @@ def declared_size(data: bytes) -> tuple[int, int] | None:
 
 
 def png_chunks(data: bytes) -> Iterator[tuple[bytes, int, int]]:
-    """Yield kind, start and end of the chunks of a PNG file. The last may end beyond the file."""
+    """Yield the kind, start and end of each chunk of a PNG file. The last chunk may end beyond the file."""
     at = 8
     while at + 12 <= len(data):
         length, kind = struct.unpack_from(">I4s", data, at)
@@ -94,12 +100,15 @@ def png_chunks(data: bytes) -> Iterator[tuple[bytes, int, int]]:
 
 
 def png_chunk(data: bytes, kind: bytes) -> bytes | None:
-    """Return the content of the first chunk of a kind in a PNG file, or None."""
+    """Return the content of the first chunk of a kind in a PNG file. Return None if there is no such chunk."""
     return next((data[at + 8 : end - 4] for name, at, end in png_chunks(data) if name == kind), None)
 
 
 def significant_bits(data: bytes) -> int | None:
-    """Return the largest number of significant bits of gray or a color in a PNG file (sBIT), or None."""
+    """Return the number of significant bits that a PNG file states in its chunk sBIT. Return None without this chunk.
+
+    If the colors have different numbers, return the largest one.
+    """
     stated = png_chunk(data, b"sBIT")
     return max(stated[:3] if len(stated) > 2 else stated[:1]) if stated else None
 
@@ -123,7 +132,7 @@ def _jpeg_marks(data: bytes) -> Iterator[int]:
 
 
 def _png_damage(data: bytes) -> str | None:
-    """Check chunks and checksums of a PNG file."""
+    """Describe the damage in the chunks of a PNG file, such as a wrong checksum. Return None if they are complete."""
     if declared_size(data) is None and len(data) >= 24:
         return "a PNG file that does not begin with its size"
     for kind, at, end in png_chunks(data):
@@ -140,7 +149,10 @@ def _png_damage(data: bytes) -> str | None:
 
 
 def _jpeg_damage(data: bytes) -> str | None:
-    """Describe the damage of a JPEG file: no end-of-image marker, too many scans, or no size."""
+    """Describe the damage in the structure of a JPEG file. Return None if it is complete.
+
+    The file is damaged if it has no end-of-image marker, too many scans, or no size.
+    """
     kinds = list(_jpeg_marks(data))
     if 0xD9 not in kinds:
         return f"a JPEG file cut short (it ends after {len(data)} bytes)"
@@ -161,8 +173,8 @@ class PnmHead:
 
     Attributes:
         size: width and height.
-        full: value of full scale.
-        end: end of the samples in the file.
+        full: stored value of full scale.
+        end: offset in the file at which the samples end.
     """
 
     size: tuple[int, int]
@@ -171,7 +183,7 @@ class PnmHead:
 
 
 def pnm_head(data: bytes) -> PnmHead | None:
-    """Parse the header of a PGM or PPM file; None if it is invalid."""
+    """Parse the header of a PGM or PPM file. Return None if it is invalid."""
     match = _PNM_HEAD.match(data[:_LARGEST_HEAD])
     if match is None:
         return None
@@ -182,7 +194,7 @@ def pnm_head(data: bytes) -> PnmHead | None:
 
 
 def pnm_damage(data: bytes) -> str | None:
-    """Describe the damage in the structure of a PGM or PPM file, or return None."""
+    """Describe the damage in the structure of a PGM or PPM file. Return None if it is complete."""
     head = pnm_head(data)
     if head is None:
         return "a PGM or PPM file without a size and full scale"
@@ -193,23 +205,25 @@ _PILLOW: dict[str, Any] = {"BMP": BmpImageFile, "JPEG": JpegImageFile, "WebP": W
 
 
 def opened_picture(data: bytes) -> Any:
-    """Open a BMP, JPEG or WebP file with Pillow without decoding it. WebP needs the whole file.
+    """Open a BMP, JPEG or WebP file with Pillow without decoding its pixels.
+
+    ``data`` may be the start of a BMP or JPEG file, but must be a whole WebP file.
 
     Raises:
-        Exception: the file is damaged; several kinds.
+        Exception: the file is damaged. Pillow raises several kinds of errors.
     """
     return _PILLOW[picture_kind(data)](io.BytesIO(data))
 
 
 def _pillow_head(data: bytes) -> Any:
-    """Open a file with ``opened_picture``; None if it is damaged or of another kind."""
+    """Open a file with ``opened_picture``. Return None if the file is damaged or of an unsupported kind."""
     with contextlib.suppress(Exception):
         return opened_picture(data)
     return None
 
 
 def pillow_damage(data: bytes) -> str | None:
-    """Describe the damage in the structure of a BMP or WebP file, or return None."""
+    """Describe the damage in the structure of a BMP or WebP file. Return None if it is complete."""
     name = picture_kind(data)
     end = 0
     try:
@@ -235,9 +249,9 @@ def pillow_damage(data: bytes) -> str | None:
 
 _AVIF = (b"avif", b"avis")
 _ORIENTATION_OF_TURNS = (1, 8, 3, 6)
-"""EXIF's orientation by quarter turns counter-clockwise."""
+"""EXIF orientation for 0, 1, 2 and 3 quarter turns counter-clockwise."""
 HIGH_RANGE = {16: "PQ", 18: "HLG"}
-"""Transfer characteristics (ITU-T H.273) for displays, which depend on more than the light at a pixel."""
+"""Names of transfer characteristics (ITU-T H.273) that cannot be converted to linear light."""
 
 
 @dataclass(frozen=True)
@@ -246,7 +260,7 @@ class HeifHead:
 
     Attributes:
         size: stored width and height, before rotation for display.
-        turns: quarter turns counter-clockwise for display.
+        turns: number of quarter turns counter-clockwise for display.
         mirrored: True if the picture is mirrored for display.
     """
 
@@ -256,12 +270,15 @@ class HeifHead:
 
     @property
     def orientation(self) -> int:
-        """Rotation as EXIF's orientation. The EXIF tag itself is informative only (ISO/IEC 23008-12)."""
+        """Rotation and mirroring for display as an EXIF orientation.
+
+        The orientation tag in the file is informative only (ISO/IEC 23008-12).
+        """
         return _ORIENTATION_OF_TURNS[self.turns]
 
 
 def heif_head(data: bytes) -> HeifHead | None:
-    """Parse the header of a HEIC file; None if it states no size."""
+    """Parse the header of a HEIC file. Return None if it states no size."""
     try:
         boxes = {kind: (start, end) for kind, start, end in _boxes(data, 0, len(data))}
         start, end = boxes[b"meta"]
@@ -284,7 +301,10 @@ def heif_head(data: bytes) -> HeifHead | None:
 
 
 def _boxes(data: bytes, start: int, end: int) -> Iterator[tuple[bytes, int, int]]:
-    """Yield kind, start and end of the contents of the boxes in a part of a file. The last may end beyond it."""
+    """Yield the kind of each box in a part of a HEIC file, and the start and end of the box's content.
+
+    The last box may end beyond the part.
+    """
     while start + 8 <= end:
         length, kind = struct.unpack_from(">I4s", data, start)
         head = 8
@@ -299,7 +319,10 @@ def _boxes(data: bytes, start: int, end: int) -> Iterator[tuple[bytes, int, int]
 
 
 def _properties(data: bytes, start: int, item: int) -> list[int]:
-    """Return the numbers, from 1, of the properties of an item in the box of associations at ``start``."""
+    """Return the numbers of the properties of an item. The first property has the number 1.
+
+    ``start`` is the offset of the box that associates items and properties.
+    """
     version = data[start]
     wide = data[start + 3] & 1
     (count,) = struct.unpack_from(">I", data, start + 4)
@@ -317,7 +340,7 @@ def _properties(data: bytes, start: int, item: int) -> list[int]:
 
 
 def heif_damage(data: bytes) -> str | None:
-    """Describe the damage in the structure of a HEIC or AVIF file, or return None."""
+    """Describe the damage in the structure of a HEIC or AVIF file. Return None if it is complete."""
     if data[8:12] in _AVIF:
         return "an AVIF file"
     if max((end for _, _, end in _boxes(data, 0, len(data))), default=0) > len(data):
@@ -329,7 +352,7 @@ def heif_damage(data: bytes) -> str | None:
 
 
 def heif_tags(data: bytes) -> bytes:
-    """Return the EXIF block of a HEIC file; empty without a block or without the package pillow-heif."""
+    """Return the EXIF block of a HEIC file. It is empty if there is no block, or if pillow-heif is not installed."""
     try:
         return bytes(
             optional_import("pillow_heif", "EXIF").open_heif(io.BytesIO(data)).info.get("exif") or b""
@@ -339,10 +362,10 @@ def heif_tags(data: bytes) -> bytes:
 
 
 def heif_colors(data: bytes) -> tuple[int | None, bytes | None]:
-    """Return transfer characteristics and ICC profile of a HEIC file.
+    """Return the transfer characteristics and the ICC profile of a HEIC file. Each is None if the file lacks it.
 
     Raises:
-        Exception: the file is damaged or pillow-heif is not installed; several kinds.
+        Exception: the file is damaged, or pillow-heif is not installed. There are several kinds of errors.
     """
     info = optional_import("pillow_heif", "color").open_heif(io.BytesIO(data)).info
     return (info.get("nclx_profile") or {}).get("transfer_characteristics"), info.get("icc_profile")
@@ -356,12 +379,13 @@ def heif_pixels(path: Path, data: bytes) -> NDArray[Any]:
         data: content of the file, after ``find_damage``.
 
     Returns:
-        [H, W, C] uint8, or uint16 for more than 8 bits at full scale, in OpenCV's order of channels.
+        [H, W, C] in OpenCV's order of channels. The type is uint8, or uint16 for files of more than 8 bits. The largest
+        value of the type is full scale.
 
     Raises:
         PolarguideError: pillow-heif is not installed.
-        ValueError: the file is unsupported; the text is a noun phrase with the reason.
-        Exception: the file is damaged; several kinds.
+        ValueError: the file is unsupported. The text of the error is a noun phrase with the reason.
+        Exception: the file is damaged. There are several kinds of errors.
     """
     library = optional_import("pillow_heif", str(path))
     head = heif_head(data)
@@ -384,7 +408,7 @@ def heif_pixels(path: Path, data: bytes) -> NDArray[Any]:
 
 
 def rescaled(pixels: NDArray[Any], full: int) -> NDArray[Any]:
-    """Rescale whole numbers with full scale ``full`` to the whole range of their type."""
+    """Rescale integers so that the value ``full`` becomes the largest value of their type."""
     largest = np.iinfo(pixels.dtype).max
     table = np.rint(np.minimum(np.arange(largest + 1) * (largest / full), largest)).astype(pixels.dtype)
     return np.asarray(table[pixels])
@@ -400,17 +424,17 @@ _YCBCR = 6
 _WHITE_IS_ZERO = 0
 _SAMPLES = {_GRAY: 1, _RGB: 3, _PALETTE: 1, _YCBCR: 3}
 JPEG_IN_TIFF = (6, 7)
-"""Compressions that convert between RGB and luminance with color differences."""
+"""Compressions of TIFF whose decoders convert the colors to RGB."""
 _NO_PICTURE = 1 | 4
-"""Bits of NewSubfileType for a thumbnail and for a transparency mask."""
+"""Bits of the tag NewSubfileType that mark a thumbnail or a transparency mask."""
 _OLD_SUBFILE_TYPE = 255
 _OLD_REDUCED = 2
-"""Value of the older tag SubfileType for a thumbnail."""
+"""Value of the older tag SubfileType that marks a thumbnail."""
 _MOST_PICTURES = 1000
 
 
 class UnreadableTiffError(ValueError):
-    """TIFF file that is not an ordinary picture; the text is a noun phrase with the reason."""
+    """Error for a TIFF file that is not an ordinary picture. Its text is a noun phrase with the reason."""
 
 
 def decode_tiff(data: bytes) -> NDArray[Any]:
@@ -424,8 +448,8 @@ def decode_tiff(data: bytes) -> NDArray[Any]:
         floating-point numbers.
 
     Raises:
-        UnreadableTiffError: the file has several pictures, or samples with another meaning.
-        Exception: the file is damaged; several kinds.
+        UnreadableTiffError: the file has several pictures, or its samples are not gray or RGB.
+        Exception: the file is damaged. tifffile raises several kinds of errors.
     """
     with tifffile.TiffFile(io.BytesIO(data)) as file:
         page = _only_page(file)
@@ -454,12 +478,12 @@ def decode_tiff(data: bytes) -> NDArray[Any]:
 _LARGEST = 281
 _SIDES = [256, 257]
 _PLAIN_TYPES = (3, 4)
-"""Usual types of width and height: unsigned integers of 16 and 32 bits."""
+"""Types of the tags for width and height that all decoders support: unsigned integers of 16 and 32 bits."""
 _LONG8 = 16
 
 
 def tiff_size(file: BinaryIO) -> tuple[int, int] | None:
-    """Return width and height in the header of a TIFF or BigTIFF file, see ``_plain_size``."""
+    """Return the width and height in the header of a TIFF or BigTIFF file. Return None as ``_plain_size`` does."""
     with (
         contextlib.suppress(Exception),
         tifffile.TiffFile(file) as opened,
@@ -469,7 +493,10 @@ def tiff_size(file: BinaryIO) -> tuple[int, int] | None:
 
 
 def _plain_size(file: tifffile.TiffFile) -> tuple[int, int] | None:
-    """Return width and height; None if a side is missing, duplicate or of an unusual type."""
+    """Return the width and height of an open TIFF file.
+
+    Return None if the tag of a side is missing, duplicate or of an unusual type.
+    """
     tags = file.pages.first.tags
     sides = [tag for code in _SIDES for tag in tags.getall(code) or ()]
     types = (*_PLAIN_TYPES, _LONG8) if file.is_bigtiff else _PLAIN_TYPES
@@ -479,7 +506,7 @@ def _plain_size(file: tifffile.TiffFile) -> tuple[int, int] | None:
 
 
 def tiff_damage(data: bytes) -> str | None:
-    """Describe the damage in the structure of a TIFF or BigTIFF file, or return None."""
+    """Describe the damage in the structure of a TIFF or BigTIFF file. Return None if it is complete."""
     name = picture_kind(data)
     try:
         with tifffile.TiffFile(io.BytesIO(data)) as file:
@@ -496,10 +523,10 @@ def tiff_damage(data: bytes) -> str | None:
 
 
 def tiff_full_scale(file: tifffile.TiffFile) -> int | None:
-    """Return the full scale that a TIFF file states, if it is below that of its type, else None.
+    """Return the full scale that a TIFF file states. Return None if it is the largest value of the type.
 
-    It follows from the bits of a sample, or from MaxSampleValue if this is all ones in binary. Other values of
-    MaxSampleValue may be the largest value that occurs.
+    It follows from the number of bits of a sample, or from the tag MaxSampleValue if its value is a power of two minus
+    1. Other values of this tag may be the largest value in the picture.
     """
     page = file.pages.first
     kind = page.dtype
@@ -515,7 +542,7 @@ def tiff_full_scale(file: tifffile.TiffFile) -> int | None:
 
 
 def _only_page(file: tifffile.TiffFile) -> tifffile.TiffPage:
-    """Return the page of the picture.
+    """Return the page of a TIFF file that has the picture.
 
     Raises:
         UnreadableTiffError: the file has several pictures, or its first page is a thumbnail.
@@ -535,10 +562,10 @@ def _only_page(file: tifffile.TiffFile) -> tifffile.TiffPage:
 
 
 def _sample_layout(page: tifffile.TiffPage) -> tuple[int, bool]:
-    """Return the number of samples per pixel, and True if the last is transparency.
+    """Return the number of samples per pixel, and True if the last sample is transparency.
 
     Raises:
-        UnreadableTiffError: the samples are not those of a gray or a color picture.
+        UnreadableTiffError: the samples are neither gray nor RGB.
     """
     meaning = int(page.photometric)
     samples = int(page.samplesperpixel)

@@ -44,7 +44,7 @@ BROKEN = (
     *(ValueError, TypeError, EOFError, OSError, MemoryError, SyntaxError, RuntimeError),
     *(tokenize.TokenError, zipfile.BadZipFile, zlib.error),
 )
-"""Errors of decoders for damaged, encrypted or contradictory files. NumPy parses headers as Python code."""
+"""Errors that decoders raise for damaged, encrypted or contradictory files. NumPy parses headers as Python code."""
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 _LARGEST_ARCHIVE = 1 << 26
 """Largest uncompressed size of an ``.npz`` file of cameras, in bytes."""
@@ -61,15 +61,15 @@ def array_kind(array: NDArray[Any]) -> str:
 
 
 def wrong_camera(where: object, expected: str, found: str) -> PolarguideError:
-    """Return the error of invalid numbers of a camera."""
+    """Return the error for a camera with invalid numbers."""
     return PolarguideError(where, expected=expected, found=found, remedy="Export the cameras again.")
 
 
 def require_camera(condition: object, where: object, expected: str, found: str) -> None:
-    """Check a condition on the numbers of a camera.
+    """Raise an error if the numbers of a camera do not meet a condition.
 
     Raises:
-        PolarguideError: the condition does not hold.
+        PolarguideError: the condition is false.
     """
     if not condition:
         raise wrong_camera(where, expected, found)
@@ -79,7 +79,7 @@ def read_array(path: Path) -> NDArray[Any]:
     """Read the array of an ``.npy`` file.
 
     Raises:
-        PolarguideError: the file cannot be read, is truncated or of another kind, or has Python objects.
+        PolarguideError: the file cannot be read, is truncated, is not an ``.npy`` file, or has Python objects.
     """
     data = read_file(path)
     try:
@@ -93,7 +93,7 @@ def read_array(path: Path) -> NDArray[Any]:
 
 
 def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
-    """Read the arrays of an ``.npz`` file of cameras by name; see ``decode_arrays``."""
+    """Read the arrays of an ``.npz`` file of cameras. The result has the arrays by name."""
     return decode_arrays(path, read_file(path))
 
 
@@ -112,10 +112,11 @@ def decode_arrays(
     Args:
         path: path of the file for messages.
         data: content of the file.
-        names: names of the requested arrays; missing arrays are ignored. Default: all arrays.
-        largest: largest uncompressed size in bytes.
-        kinds: accepted types of values as NumPy's kind codes.
-        expected, remedy: fields of the error.
+        names: names of the requested arrays. Missing arrays are ignored. By default, all arrays are decoded.
+        largest: largest uncompressed size of the file in bytes.
+        kinds: types of values that are accepted, as NumPy's kind codes.
+        expected: field of the error.
+        remedy: field of the error.
 
     Raises:
         PolarguideError: the file is damaged or encrypted, or decompresses to more than ``largest`` bytes.
@@ -137,10 +138,10 @@ def decode_arrays(
 
 
 def _member(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> bytes:
-    """Decompress a member of an archive, but no more bytes than its header states.
+    """Decompress a member of an archive. At most as many bytes are decompressed as its header states.
 
     Raises:
-        One of ``BROKEN``: the member is damaged, or has a compression without such a bound, which NumPy does not use.
+        One of ``BROKEN``: the member is damaged, or its compression is not one that NumPy writes.
     """
     if entry.compress_type not in _METHODS:
         raise ValueError(f"{entry.filename} has a compression that NumPy does not use")
@@ -149,10 +150,10 @@ def _member(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> bytes:
 
 
 def finite_numbers(where: object, array: object, shapes: tuple[tuple[int, ...], ...]) -> NDArray[np.float64]:
-    """Convert an array of finite numbers in one of the shapes to float64.
+    """Convert an array of finite numbers to float64 after a check of its shape.
 
     Raises:
-        PolarguideError: the array has another shape or type, or values that are not finite.
+        PolarguideError: the shape is not in ``shapes``, the values are not numbers, or a value is not finite.
     """
     expected = f"finite numbers in shape {' or '.join('x'.join(map(str, shape)) for shape in shapes)}"
     try:
@@ -165,7 +166,9 @@ def finite_numbers(where: object, array: object, shapes: tuple[tuple[int, ...], 
 
 
 def array_header(stream: io.BytesIO) -> tuple[tuple[int, ...], np.dtype[Any]]:
-    """Read shape and type from the header of ``.npy``; the stream ends up at the values.
+    """Read the shape and type of the values from the header of an ``.npy`` stream.
+
+    Afterwards, the position of the stream is the start of the values.
 
     Raises:
         One of ``BROKEN``: the header is invalid.
@@ -177,9 +180,10 @@ def array_header(stream: io.BytesIO) -> tuple[tuple[int, ...], np.dtype[Any]]:
 
 
 def _array(data: bytes, kinds: str) -> NDArray[Any]:
-    """Decode ``.npy``. A header that states more values than the file has is refused before memory is allocated.
+    """Decode the content of an ``.npy`` file.
 
-    ``kinds`` are the accepted types of values as NumPy's kind codes.
+    If the file has fewer values than its header states, it is refused before memory is allocated. ``kinds`` has the
+    types of values that are accepted, as NumPy's kind codes.
     """
     stream = io.BytesIO(data)
     shape, dtype = array_header(stream)
@@ -195,7 +199,7 @@ _EXR_MAGIC = b"\x76\x2f\x31\x01"
 
 
 def read_radiance(path: Path) -> NDArray[np.float32]:
-    """Read a linear picture. Values may be negative or above 1 and stay as they are.
+    """Read a linear picture. Values may be negative or larger than 1, and are not changed.
 
     Args:
         path: Radiance ``.hdr``, OpenEXR ``.exr`` (package OpenEXR) or ``.npy`` with [H, W], [H, W, 1] or [H, W, 3].
@@ -204,7 +208,7 @@ def read_radiance(path: Path) -> NDArray[np.float32]:
         [H, W, 3] float32, RGB. A gray picture becomes three equal channels.
 
     Raises:
-        PolarguideError: the file cannot be read, is damaged or of another kind, or a package is missing.
+        PolarguideError: the file cannot be read, is damaged, is of an unsupported kind, or a package is missing.
     """
     suffix = path.suffix.lower()
     if suffix == ".hdr":
@@ -246,10 +250,13 @@ def _read_hdr(path: Path) -> NDArray[Any]:
 
 
 def read_exr(path: Path, *choices: Sequence[str]) -> NDArray[Any]:
-    """Read named channels [H, W, C] of an OpenEXR file: the first of the choices that is complete.
+    """Read the color or gray channels of an OpenEXR file, [H, W, C].
+
+    The file may name its channels in several ways. The first set of names is used whose channels all exist.
 
     Raises:
-        PolarguideError: the file cannot be read, is damaged or lacks channels, or the package OpenEXR is missing.
+        PolarguideError: the file cannot be read, is damaged, or has no such channels. Or the package OpenEXR is
+            missing.
     """
     data = read_file(path)
     package = optional_import("OpenEXR", str(path))
@@ -271,18 +278,20 @@ def read_exr(path: Path, *choices: Sequence[str]) -> NDArray[Any]:
 
 
 def hdr_size(data: bytes) -> tuple[int, int] | None:
-    """Return width and height in the header of a Radiance file."""
+    """Return the width and height in the header of a Radiance file. Return None if it is invalid."""
     # The size follows the first empty line.
     size = _HDR_SIZE.match(data, data.find(b"\n\n", 0, 4096) + 2)
     return None if size is None or not data.startswith(b"#?") else (int(size[2]), int(size[1]))
 
 
 def exr_size(path: Path) -> tuple[int, int]:
-    """Return width and height of the last window in the headers of an OpenEXR file without decoding it.
+    """Return the width and height of an OpenEXR file from its headers, without decoding pixels.
+
+    If the file has several parts, return the size of the last part.
 
     Raises:
-        ValueError: a window is larger than any picture.
-        Exception: the file is damaged; several kinds.
+        ValueError: a part has more pixels than a picture may have.
+        Exception: the file is damaged. The package raises several kinds of errors.
         PolarguideError: the package OpenEXR is missing.
     """
     package = optional_import("OpenEXR", str(path))
@@ -303,7 +312,7 @@ TRANSFERS = ("linear", "srgb")
 _DECODED = 16
 
 FULL_CODE = 65535
-"""Code of linear intensity 1."""
+"""Code that represents the linear intensity 1."""
 MOST_MATERIAL = 255
 MATERIAL_REMEDY = (
     "Write the numbers 0 (unknown), 1 (dielectric) and 2 (metal), not gray levels. Define other numbers in materials "
@@ -316,16 +325,16 @@ def decode_picture(path: Path, data: bytes) -> NDArray[Any]:
 
     Args:
         path: path of the file for messages.
-        data: content of the file: PNG, JPEG, WebP, HEIC, BMP, PGM, PPM or TIFF of 8 or 16 bits a channel, gray or
-            color; TIFF of floating-point numbers from 0 to 1, which become 16 bits (larger numbers become full scale).
-            Fewer bits, see ``stated_full_scale``, are rescaled to 8 or 16. Alpha is dropped. An orientation tag is
-            ignored, because poses refer to stored pixels.
+        data: content of a PNG, JPEG, WebP, HEIC, BMP, PGM, PPM or TIFF file, gray or color. A channel has 8 or 16 bits.
+            Files with fewer bits, see ``stated_full_scale``, are rescaled to 8 or 16. A TIFF file of floating-point
+            numbers from 0 to 1 is converted to 16 bits, and larger numbers become full scale. An opaque alpha channel
+            is removed. An orientation tag is ignored, because poses refer to the stored pixels.
 
     Returns:
-        Stored pixels [H, W, 3] uint8 or uint16, RGB. A gray picture becomes three equal channels.
+        Stored pixels [H, W, 3] uint8 or uint16, RGB. A gray picture has three equal channels.
 
     Raises:
-        PolarguideError: the file is damaged, truncated, of another kind, or has transparent pixels.
+        PolarguideError: the file is damaged, truncated, of an unsupported kind, or has transparent pixels.
     """
     pixels = decode_stored(path, data)
     full = stated_full_scale(path, io.BytesIO(data), pixels)
@@ -373,11 +382,12 @@ def decode_mask(path: Path, data: bytes, *, any_value: bool) -> NDArray[np.bool_
     Args:
         path: path of the file for messages.
         data: content of the file.
-        any_value: if True, the mask has the pixels with a nonzero channel; otherwise those of at least half of the
-            maximum, which supports masks of 0 and 1, of 0 and 255, and with soft edges.
+        any_value: if True, the mask contains the pixels with a nonzero channel. If False, it contains the pixels whose
+            value is at least half of the maximum. This supports files with the values 0 and 1, files with 0 and 255,
+            and soft edges.
 
     Raises:
-        PolarguideError: the file is damaged, truncated, of another kind, or has two different masks.
+        PolarguideError: the file is damaged, truncated, of an unsupported kind, or has two different masks.
     """
     pixels = decode_stored(path, data)
     gray = pixels if pixels.ndim == 2 else pixels[..., :3].max(axis=2)
@@ -394,10 +404,10 @@ _SMALL_AREA = 1e-3  # share of a picture; areas of one gray in a soft edge are s
 
 
 def _require_two_levels(path: Path, gray: NDArray[Any]) -> None:
-    """Refuse labels of several objects, because those below half of the maximum would count as background.
+    """Refuse a picture that labels several objects instead of the foreground.
 
-    Labels are areas of more than two grays, one of them below half of the maximum. Soft edges change from pixel to
-    pixel.
+    Small labels would be taken for background. A picture has labels if it has uniform areas of more than two grays, of
+    which one is less than half of the maximum. The grays of soft edges change from pixel to pixel.
 
     Raises:
         PolarguideError: the picture has labels.
@@ -419,10 +429,10 @@ def _require_two_levels(path: Path, gray: NDArray[Any]) -> None:
 
 
 def _require_one_mask(path: Path, pixels: NDArray[Any], mask: NDArray[np.bool_]) -> None:
-    """Refuse a picture with different masks in its colors and its transparency.
+    """Refuse a picture whose colors and whose transparency show two different masks.
 
     Raises:
-        PolarguideError: colors and transparency contradict one another.
+        PolarguideError: the two masks differ.
     """
     if pixels.shape[2:] != (4,) or pixels.dtype.kind != "u":
         return
@@ -437,10 +447,12 @@ def _require_one_mask(path: Path, pixels: NDArray[Any], mask: NDArray[np.bool_])
 
 
 def decode_materials(path: Path, data: bytes) -> NDArray[np.uint8]:
-    """Decode a picture of materials into [H, W]: 0 unknown, 1 dielectric, 2 metal, other numbers as in ``scene.json``.
+    """Decode a picture of material labels, [H, W].
+
+    The label 0 means unknown, 1 dielectric and 2 metal. ``scene.json`` defines the other labels.
 
     Raises:
-        PolarguideError: the file is damaged, truncated, of another kind, lossy, or has a value above 255.
+        PolarguideError: the file is damaged, truncated, of an unsupported kind or lossy. Or it has a value above 255.
     """
     pixels = decode_stored(path, data)
     require(
@@ -462,7 +474,7 @@ def decode_materials(path: Path, data: bytes) -> NDArray[np.uint8]:
 
 
 def linear_codes(pixels: NDArray[Any], transfer: str) -> NDArray[np.uint16]:
-    """Convert stored 8- or 16-bit values to round(65535 * linear intensity), same shape, uint16."""
+    """Convert stored 8- or 16-bit values to the codes ``round(65535 * linear intensity)``, uint16."""
     if pixels.dtype == np.uint16 and transfer == "linear":
         return pixels.astype(np.uint16, copy=False)
     return _table(int(np.iinfo(pixels.dtype).max), transfer)[pixels]
@@ -470,7 +482,7 @@ def linear_codes(pixels: NDArray[Any], transfer: str) -> NDArray[np.uint16]:
 
 @functools.cache
 def _table(full: int, transfer: str) -> NDArray[np.uint16]:
-    """Compute the linear code of each stored value in 0..full."""
+    """Compute the linear code of each stored value from 0 to ``full``."""
     levels = np.arange(full + 1) / full
     if transfer == "srgb":
         levels = srgb_decode_array(levels)
@@ -478,13 +490,13 @@ def _table(full: int, transfer: str) -> NDArray[np.uint16]:
 
 
 def decode_stored(path: Path, data: bytes) -> NDArray[Any]:
-    """Decode a picture as stored: [H, W] or [H, W, C] in OpenCV's channel order, any value type.
+    """Decode a picture without conversion: [H, W] or [H, W, C] in OpenCV's order of channels, of any type.
 
     TIFF is decoded by tifffile, HEIC by pillow-heif, and other kinds by OpenCV after a check of their structure. Pillow
     would reduce 16-bit color to 8 bits.
 
     Raises:
-        PolarguideError: the file is damaged, truncated, of another kind, or has samples of another meaning.
+        PolarguideError: the file is damaged, truncated, of an unsupported kind, or its samples are not gray or RGB.
     """
     damage = find_damage(data)
     size = None if damage is not None else declared_size(data)
@@ -522,7 +534,7 @@ def decode_stored(path: Path, data: bytes) -> NDArray[Any]:
 
 
 def _unreadable(path: Path, found: str) -> PolarguideError:
-    """Return the error of an unsupported file; ``found`` is a noun phrase."""
+    """Return the error for an unsupported file. ``found`` is a noun phrase that describes it."""
     if "HEIC" in found or "AVIF" in found:
         return PolarguideError(
             path,
@@ -534,12 +546,12 @@ def _unreadable(path: Path, found: str) -> PolarguideError:
 
 
 def is_lossy(path: Path) -> bool:
-    """Return True for a lossy kind of file, which is sRGB by convention: JPEG, WebP or HEIC, by suffix."""
+    """Return True if the suffix is that of JPEG, WebP or HEIC. These lossy formats are sRGB by convention."""
     return path.suffix.lower() in _LOSSY
 
 
 def _loses_detail(data: bytes) -> bool:
-    """Return True if the compression of a picture changes its values, by content."""
+    """Return True if the content of a picture file has a lossy compression."""
     kind = picture_kind(data)
     if kind == "WebP":
         chunk = re.search(rb"VP8[ L]", data)  # first chunk of pixels
@@ -551,10 +563,10 @@ def _loses_detail(data: bytes) -> bool:
 
 
 def stated_full_scale(path: Path, file: BinaryIO, samples: NDArray[Any]) -> int | None:
-    """Return the full scale that a picture file states, if it is below that of its type, else None.
+    """Return the full scale that a picture file states. Return None if it is the largest value of the type.
 
-    It is the maximum of PGM and PPM, follows from bits or MaxSampleValue of TIFF, or from significant bits (sBIT) of
-    PNG.
+    PGM and PPM state it in the header. For TIFF it follows from the number of bits or from MaxSampleValue, and for PNG
+    from the number of significant bits (sBIT).
 
     Args:
         path: path of the file for messages.
@@ -592,8 +604,8 @@ def stated_full_scale(path: Path, file: BinaryIO, samples: NDArray[Any]) -> int 
 def _full_of_significant(samples: NDArray[Any], bits: int | None) -> int | None:
     """Return the full scale of a PNG file with significant bits.
 
-    By the standard, they are the highest of all bits. Cameras' programs may use the lowest: then all samples are small
-    and low bits are used.
+    According to the standard, the significant bits are the high bits. Some programs of cameras store them as low bits
+    instead. The function detects this case if all samples are small and their low bits are used.
     """
     kind = np.iinfo(samples.dtype)
     if bits is None or not 0 < bits < kind.bits:
@@ -604,9 +616,9 @@ def _full_of_significant(samples: NDArray[Any], bits: int | None) -> int | None:
 
 
 def may_use_fewer_bits(path: Path) -> bool:
-    """Return True for a 16-bit picture file whose values may have fewer bits.
+    """Return True for a 16-bit picture file that may have values of a sensor with fewer bits.
 
-    Cameras of 10 to 14 bits write PNG and TIFF files of 16 bits, usually without stating the bits.
+    Cameras with 10 to 14 bits write 16-bit PNG and TIFF files, which usually do not state the number of bits.
     """
     if not path.is_file():  # opening a pipe would block
         return False
@@ -622,7 +634,7 @@ def may_use_fewer_bits(path: Path) -> bool:
 
 
 def _require_memory(path: Path, size: tuple[int, int] | None) -> None:
-    """Distinguish a lack of memory from damage, which look alike to a decoder.
+    """Check that there is enough memory to decode a picture. Decoders report a lack of memory like damage.
 
     Raises:
         PolarguideError: there is too little memory for a picture of this size and its decoder.
@@ -641,13 +653,13 @@ def _require_memory(path: Path, size: tuple[int, int] | None) -> None:
 
 HEAD = 1 << 20
 LARGEST_PIXEL = 32
-"""Largest size of a pixel in bytes: four channels of 64 bits without compression."""
+"""Largest size of a pixel in a file in bytes: four channels of 64 bits without compression."""
 ROOM = 1 << 26
 """Largest size of a picture file's metadata in bytes, such as previews and profiles."""
 
 
 def stated_size(path: Path) -> tuple[int, int] | None:
-    """Return width and height in the header of a picture or an array, or None.
+    """Return the width and height in the header of a picture or an array. Return None if they cannot be read.
 
     Supported are PNG, JPEG, WebP, HEIC, BMP, PGM, TIFF, Radiance HDR, OpenEXR and ``.npy``.
     """
@@ -667,7 +679,7 @@ def stated_size(path: Path) -> tuple[int, int] | None:
 
 
 def read_picture(path: Path) -> bytes:
-    """Read a picture file, unless it is far larger than its pixels could be.
+    """Read the content of a picture file. A file that is far too large for its number of pixels is refused.
 
     Raises:
         PolarguideError: the file is too large or cannot be read.
@@ -679,6 +691,6 @@ def read_picture(path: Path) -> bytes:
 
 
 def _array_size(head: bytes) -> tuple[int, int] | None:
-    """Return width and height of an ``.npy`` file of two or more axes, rows first."""
+    """Return the width and height of an array in an ``.npy`` file. The first axis of the array has the rows."""
     shape, _ = array_header(io.BytesIO(head))
     return (int(shape[1]), int(shape[0])) if len(shape) > 1 else None

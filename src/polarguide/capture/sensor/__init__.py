@@ -1,1 +1,1 @@
-"""Polarization sensors with a filter on each pixel: from raw mosaics to intensities at four polarizer angles."""
+"""Convert raw mosaics of polarization sensors to intensities at four polarizer angles."""

@@ -30,13 +30,14 @@ Array = NDArray[np.float32]
 
 
 def correction_matrices(analyzers: list[Array], nominal: NDArray[Any]) -> Array:
-    """Compute the matrices from measured samples of a cell to those of ideal polarizers.
+    """Compute the matrix C that converts the four samples of each polarizer cell to those of ideal polarizers.
 
-    ``C = W pinv(A) + n m^T``: A [4, 3] are the analyzer vectors, W those of ideal polarizers, n and m the unit vectors
-    perpendicular to the columns of W and A. C A = W, and C is the identity if A is W.
+    ``C = W pinv(A) + n m^T``. A [4, 3] has the analyzer vectors of the samples, and W [4, 3] those of ideal polarizers.
+    The unit vectors n and m are perpendicular to the columns of W and A. As a result, C A = W. If A is equal to W, C is
+    the identity.
 
     Args:
-        analyzers: analyzer vectors of the four samples of a cell, [..., 3] each.
+        analyzers: four arrays [..., 3] with the analyzer vectors of the four samples of each cell.
         nominal: nominal angles of the samples in degrees.
 
     Returns:
@@ -77,11 +78,14 @@ def correction_matrices(analyzers: list[Array], nominal: NDArray[Any]) -> Array:
 
 
 CALIBRATED_IMBALANCE = 0.01
-"""Largest imbalance of the pair sums of a calibrated sensor; more is a sign of another camera's calibration."""
+"""Largest relative difference of the pair sums of a calibrated sensor.
+
+A larger difference is a sign that the calibration is that of another camera.
+"""
 
 
 def imbalance_notes(ratio: float | None) -> list[str]:
-    """Return notes for the user on the ratio of the pair sums after calibration."""
+    """Return a note for the user if the ratio of the pair sums deviates from 1 after calibration."""
     notes = (
         []
         if ratio is None
@@ -95,9 +99,9 @@ def imbalance_notes(ratio: float | None) -> list[str]:
 
 
 FARTHEST_ANGLE = np.radians(20.0)
-"""Largest deviation of a polarizer from its nominal angle, in radians."""
+"""Largest deviation of a pixel's polarizer from its nominal angle that is accepted, in radians."""
 LEAST_DIATTENUATION = 0.3
-"""Smallest diattenuation of a pixel's polarizer with a meaningful angle (extinction ratio 1.9)."""
+"""Smallest diattenuation of a pixel's polarizer that is accepted. It corresponds to an extinction ratio of 1.9."""
 # Number of rows of cells per batch of matrices, which must fit into the processor's cache.
 _BATCH = 16
 
@@ -106,20 +110,22 @@ Reference = Literal["angles", "mean"]
 
 @dataclass(frozen=True, eq=False)
 class AnalyzerCalibration:
-    """Analyzer vectors of a sensor, or of a region of it.
+    """Calibration of a polarization sensor: the analyzer vectors of its pixels.
 
     Attributes:
         sensor: name of the sensor, a key of ``SENSORS``.
-        lens: the user's name of the lens, or "".
-        offset: column and row of the sensor at which the region starts.
-        size: width and height of the region.
-        block: side in pixels of the blocks that share vectors; the period of the pattern for a vector per pixel.
-        vectors: [rows, columns, P, P, 3] float32 for a pattern of the period P: the vector of a pixel in column x and
-            row y of the sensor is ``vectors[y // block - offset_y // block, x // block - offset_x // block, y % P,
-            x % P]``. Scale: the mean of the first components around a pixel, of its color, is 1/2.
-        reference: origin of the angles: "angles" of the polarizer as specified, or "mean", for which the mean deviation
-            of the positions from their nominal angles is zero.
-        polarizer_extinction: extinction ratio of the polarizer in front of the light; None for an ideal one.
+        lens: name of the lens that the user specified, or "".
+        offset: column and row of the sensor at which the calibrated region starts.
+        size: width and height of the calibrated region.
+        block: side of the blocks whose pixels share vectors, in pixels. If it is the period of the pattern, each pixel
+            has a vector of its own.
+        vectors: [rows, columns, P, P, 3] float32 for a pattern with the period P. The vector of the pixel in column x
+            and row y of the sensor is ``vectors[y // block - offset_y // block, x // block - offset_x // block,
+            y % P, x % P]``. Vectors are scaled: the mean first component of the pixels of a color in a neighborhood
+            is 1/2.
+        reference: meaning of angle zero. "angles" means that the angles of the polarizer during the calibration were
+            known. "mean" means that the pixels have their nominal angles on average.
+        polarizer_extinction: extinction ratio of the polarizer in front of the light; None for an ideal polarizer.
         sha256: checksum of all other attributes.
     """
 
@@ -145,11 +151,11 @@ class AnalyzerCalibration:
         """Refuse a calibration of another sensor.
 
         Args:
-            sensor: sensor of the pictures, None if unknown.
-            where: place for messages.
+            sensor: sensor of the pictures, or None if it is unknown.
+            where: file that an error message names.
 
         Raises:
-            PolarguideError: the calibration is of another sensor.
+            PolarguideError: the calibration belongs to another sensor.
         """
         require(
             sensor is None or sensor == self.sensor,
@@ -163,8 +169,9 @@ class AnalyzerCalibration:
         """Refuse a region outside the calibrated one.
 
         Args:
-            offset, size: offset and size of the region, in columns and rows of the sensor.
-            where: place for messages.
+            offset: column and row of the sensor at which the region starts.
+            size: width and height of the region.
+            where: file that an error message names.
 
         Raises:
             PolarguideError: the region is not inside the calibrated one.
@@ -182,7 +189,7 @@ class AnalyzerCalibration:
         )
 
     def record(self) -> dict[str, str]:
-        """Return the calibration's entry in ``scene.json``."""
+        """Return the entry of ``scene.json`` that identifies the calibration."""
         return {"sensor": self.sensor, "lens": self.lens, "sha256": self.sha256}
 
     def apply(
@@ -190,22 +197,25 @@ class AnalyzerCalibration:
     ) -> Array:
         """Compute the intensities that ideal polarizers would measure.
 
-        For the four samples I of a cell with the analyzer vectors A [4, 3], ``pinv(A) I`` is the Stokes vector. The
-        result are its intensities behind ideal polarizers. The component of I that no Stokes vector explains (for an
-        ideal sensor, I0 - I45 + I90 - I135) does not change. So samples of an ideal sensor stay as they are, and noise
-        remains measurable. Samples must be linear without black level; any scale is possible.
+        The Stokes vector of a cell is ``pinv(A) I``, with the four samples I and their analyzer vectors A [4, 3]. The
+        result has the intensities of this Stokes vector behind ideal polarizers. The component of I that no Stokes
+        vector explains does not change; for an ideal sensor it is I0 - I45 + I90 - I135. The samples of an ideal
+        sensor therefore do not change, and noise remains measurable.
 
         Args:
-            values: a mosaic [H, W]; or four intensities at 0, 45, 90 and 135 degrees, [4, h, w] or [4, h, w, C] with
-                1 or 3 channels. Intensities have the size of the mosaic, half or a quarter of it.
-            offset: column and row of the sensor at which the mosaic starts; default: that of the calibration.
-            scale: sensor pixels per pixel of the intensities, in each direction (1, 2 or 4); default: by the size.
+            values: linear values without black level, on any scale. Either a mosaic [H, W], or the intensities at 0,
+                45, 90 and 135 degrees, [4, h, w] or [4, h, w, C] with 1 or 3 channels. The sides of the intensities are
+                those of the mosaic, or half or a quarter of them.
+            offset: column and row of the sensor at which the mosaic starts. By default, it starts like the calibrated
+                region.
+            scale: number of sensor pixels per pixel of the intensities in each direction: 1, 2 or 4. By default, it
+                follows from the size.
 
         Returns:
             float32 in the shape of ``values``. Rows and columns of incomplete cells do not change.
 
         Raises:
-            PolarguideError: the calibration has another size.
+            PolarguideError: the size of the values does not match the calibration.
             ValueError: the shape is invalid.
         """
         values = np.asarray(values, np.float32)
@@ -217,20 +227,21 @@ class AnalyzerCalibration:
         return self._four(values, start, scale)
 
     def correction(self, offset: tuple[int, int], size: tuple[int, int]) -> Array:
-        """Return the matrix of each cell of a region.
+        """Return the matrix that corrects the samples of each cell of a region.
 
         Args:
-            offset: column and row of the sensor at the start of a cell.
-            size: width and height in pixels, even.
+            offset: column and row of the sensor at which the region starts. A cell must start there.
+            size: width and height of the region in pixels; both are even.
 
         Returns:
-            Matrices from the samples of a cell in row order to the corrected samples, [4, 4, height / 2, width / 2].
+            [4, 4, height / 2, width / 2]. A matrix converts the four samples of a cell, in the order of rows, to the
+            corrected samples.
         """
         matrices, rows, columns = self._coarse(offset, size)
         return np.ascontiguousarray(matrices[:, :, rows[:, None], columns])
 
     def peak(self, offset: tuple[int, int], size: tuple[int, int]) -> float:
-        """Return the largest corrected intensity for samples up to 1 in a region."""
+        """Return the largest intensity that the correction can give in a region if all samples are at most 1."""
         matrices, _, _ = self._coarse(offset, size)
         return float(np.maximum(matrices, 0).sum(axis=1).max())
 
@@ -274,17 +285,18 @@ class AnalyzerCalibration:
     def of_pictures(
         self, shape: tuple[int, ...], *, offset: tuple[int, int] | None = None, scale: int | None = None
     ) -> Array:
-        """Return the matrix of each pixel of developed pictures.
+        """Return the matrix that corrects each pixel of developed pictures.
 
         Args:
             shape: height and width of the pictures.
-            offset, scale: arguments of ``apply``.
+            offset: see ``apply``.
+            scale: see ``apply``.
 
         Returns:
-            Matrices of ``correction_of_angles``.
+            The matrices, see ``correction_of_angles``.
 
         Raises:
-            PolarguideError: the calibration has another size.
+            PolarguideError: the size of the pictures does not match the calibration.
         """
         offset = self.offset if offset is None else offset
         left, top = self.pattern.shifted(*offset).cell_corner()
@@ -304,12 +316,12 @@ class AnalyzerCalibration:
         return self.correction_of_angles(start, (width * step, height * step), step)
 
     def correction_of_angles(self, offset: tuple[int, int], size: tuple[int, int], scale: int) -> Array:
-        """Return the matrix of each pixel of four intensities at 0, 45, 90 and 135 degrees.
+        """Return the matrix that corrects the intensities at 0, 45, 90 and 135 degrees at each pixel of pictures.
 
         Args:
-            offset: column and row of the sensor at the start of a cell.
-            size: width and height in pixels of the sensor.
-            scale: sensor pixels per pixel of the intensities, in each direction: 1, 2 or 4.
+            offset: column and row of the sensor at which the pictures start. A cell must start there.
+            size: width and height of the pictures in pixels of the sensor.
+            scale: number of sensor pixels per pixel of the pictures in each direction: 1, 2 or 4.
 
         Returns:
             [4, 4, h, w], or [4, 4, h, w, 3] for a color sensor, whose colors have different analyzers.
@@ -340,7 +352,11 @@ class AnalyzerCalibration:
     def _coarse(
         self, offset: tuple[int, int], size: tuple[int, int]
     ) -> tuple[Array, NDArray[np.intp], NDArray[np.intp]]:
-        """Return the distinct matrices [4, 4, R, C], and their indices for each row and column of cells."""
+        """Compute the matrices of a region without duplicates.
+
+        Returns:
+            The matrices [4, 4, R, C]; and the index into R for each row of cells, and into C for each column.
+        """
         key = (offset, size)
         grid = self._matrices.get(key)
         if grid is None:
@@ -362,10 +378,11 @@ class AnalyzerCalibration:
         return grid
 
     def _places(self, axis: int, start: int, length: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Return the distinct rows (axis 0) or columns (1) of cells, and the index of each row or column.
+        """Find the rows (axis 0) or columns (axis 1) of cells that have different matrices.
 
         Returns:
-            [4, R]: block and place in the pattern of a cell's first row, and of its second; and indices [length / 2].
+            [4, R] for R different rows: block and place in the pattern for the first and for the second pixel row of
+            the cell; and the index into R for each row of cells, [length / 2].
         """
         period = self.pattern.period
         last = self.vectors.shape[axis] - 1
@@ -380,14 +397,17 @@ class AnalyzerCalibration:
 
 
 def spread_to_cells(bad: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Spread a mask of unusable samples [H, W] of a mosaic to all of their cells, because correction mixes cells."""
+    """Extend a mask of unusable samples of a mosaic, [H, W], to whole cells.
+
+    The correction by a calibration mixes the samples of a cell.
+    """
     height, width = bad.shape
     cells = bad.reshape(height // 2, 2, width // 2, 2).any(axis=(1, 3))
     return np.repeat(np.repeat(cells, 2, axis=0), 2, axis=1)
 
 
 def grid_shape(offset: tuple[int, int], size: tuple[int, int], block: int) -> tuple[int, int]:
-    """Return the number of rows and columns of blocks in a region; blocks start at the corner of the sensor."""
+    """Return the numbers of rows and columns of blocks that a region touches. Blocks start at the sensor's corner."""
     rows, columns = (
         (start + length - 1) // block - start // block + 1
         for start, length in zip(offset[::-1], size[::-1], strict=True)
@@ -418,7 +438,7 @@ _NotNegative = Annotated[int, msgspec.Meta(ge=0, le=1 << 20)]
 
 
 class _Metadata(msgspec.Struct, forbid_unknown_fields=True):
-    """Metadata of the file, stored as one entry."""
+    """Metadata of a calibration file. They are stored as a single entry of the file."""
 
     format: str
     version: int
@@ -439,7 +459,7 @@ UNITS = "intensity per Stokes component, (S0, S1, S2); an ideal polarizer has (1
 
 
 def is_analyzer_file(path: Path) -> bool:
-    """Return True if a file is likely a file of analyzers, and False for JSON or an unreadable file."""
+    """Return True if a file looks like a calibration of analyzer vectors. A JSON or unreadable file gives False."""
     try:
         if not path.is_file():  # opening a pipe would block
             return False
@@ -453,7 +473,7 @@ def is_analyzer_file(path: Path) -> bool:
 
 
 def write_analyzers(path: Path, calibration: AnalyzerCalibration) -> str:
-    """Write the file of a calibration and return its checksum. Equal content gives equal bytes.
+    """Write a calibration to a file, and return its checksum. The same calibration always gives the same bytes.
 
     Raises:
         PolarguideError: the file cannot be written.
@@ -476,7 +496,7 @@ def write_analyzers(path: Path, calibration: AnalyzerCalibration) -> str:
 
 
 def read_analyzers(path: Path) -> AnalyzerCalibration:
-    """Read a file of ``polarguide calibrate``.
+    """Read a calibration from a file that ``polarguide calibrate`` wrote.
 
     Raises:
         PolarguideError: the file cannot be read, is truncated, damaged, or of another kind or version.
@@ -512,10 +532,11 @@ def read_analyzers(path: Path) -> AnalyzerCalibration:
 
 
 def _require_sound(path: Path, calibration: AnalyzerCalibration) -> None:
-    """Refuse invalid content with a valid checksum.
+    """Refuse a calibration whose checksum is valid but whose content is not.
 
     Raises:
-        PolarguideError: the sensor is unknown, or the vectors have another shape or belong to no polarizer.
+        PolarguideError: the sensor is unknown, the shape of the vectors is wrong, or a vector is not that of a
+            polarizer.
     """
     _require(calibration.sensor in SENSORS, path, f"the unknown sensor {calibration.sensor!r}")
     period = calibration.pattern.period

@@ -17,7 +17,10 @@ Array = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
 GUIDED_RADIUS = 3
-"""Largest distance in pixels at which a sample has influence in a guided interpolation: 2 for the guide, 1 beyond."""
+"""Largest distance in pixels between a sample and a pixel that depends on it in guided interpolation.
+
+The guide is computed from samples at a distance of up to 2 pixels, and is used at a distance of 1 pixel.
+"""
 
 _TENT = np.outer([1, 2, 1], [1, 2, 1]).astype(np.float32)
 _HALVES = np.array([0.5, 1, 0.5], np.float32)
@@ -26,25 +29,26 @@ _SOFT_SQUARE = np.float32(1e-4)
 
 
 def interpolate_bilinear(values: Array, known: Mask) -> Array:
-    """Interpolate samples at every second pixel or in a checkerboard bilinearly.
+    """Interpolate samples bilinearly. The samples form a checkerboard, or are in every second row and column.
 
     Args:
-        values: samples [H, W]; ignored where ``known`` is False.
+        values: samples [H, W]. A value is ignored if ``known`` is False.
         known: mask of the samples, [H, W].
 
     Returns:
-        [H, W]; known samples do not change.
+        [H, W]. The samples themselves do not change.
     """
     weight = _filtered(known.astype(np.float32))
     return np.where(known, values, _filtered(np.where(known, values, np.float32(0))) / weight)
 
 
 def bilinear_cells(mosaic: Array, row: int, column: int, out: Array) -> None:
-    """Interpolate the samples at every second row from ``row`` and every second column from ``column``.
+    """Interpolate the samples in every second row and every second column of a mosaic bilinearly.
 
     Args:
         mosaic: mosaic [H, W], H and W even.
-        row, column: 0 or 1.
+        row: first row with samples, 0 or 1.
+        column: first column with samples, 0 or 1.
         out: output [H, W].
     """
     spread = np.zeros_like(mosaic)
@@ -54,7 +58,15 @@ def bilinear_cells(mosaic: Array, row: int, column: int, out: Array) -> None:
 
 
 def guided_color(bayer: Array, colors: NDArray[np.int64]) -> Array:
-    """Interpolate a Bayer picture [H, W] with ``colors`` 0, 1, 2 (R, G, B) at its pixels to [H, W, 3]."""
+    """Interpolate the missing colors of a Bayer picture. Directions with strong gradients get small weights.
+
+    Args:
+        bayer: values [H, W].
+        colors: color of each pixel, 0, 1 or 2 for R, G or B.
+
+    Returns:
+        [H, W, 3].
+    """
     at = _neighbors(bayer)
     center = 2 * bayer
     bend_x = center - at(0, -2) - at(0, 2)
@@ -69,7 +81,12 @@ def guided_color(bayer: Array, colors: NDArray[np.int64]) -> Array:
 
 
 def _half_s0(mosaic: Array) -> Array:
-    """Estimate S0/2 at each pixel: mean of its four 2x2 windows, weighted against gradients toward them."""
+    """Estimate ``S0 / 2`` at each pixel of a mosaic.
+
+    A pixel belongs to four windows of 2 x 2 pixels. The mean of each window is an estimate, because a window has all
+    four angles. The result is the weighted mean of the four estimates. A window has a small weight if the picture
+    changes strongly from the pixel toward this window.
+    """
     at = _neighbors(mosaic)
     total = np.zeros_like(mosaic)
     weights = np.zeros_like(mosaic)
@@ -88,7 +105,11 @@ def _half_s0(mosaic: Array) -> Array:
 
 
 def _neighbors(values: Array) -> Callable[[int, int], Array]:
-    """Return a function of (y, x) that shifts the picture: the value ``y`` pixels below and ``x`` to the right."""
+    """Return a function that shifts a picture.
+
+    The function has the arguments y and x. At each pixel, its result is the value y pixels below and x pixels to the
+    right.
+    """
     height, width = values.shape
     # Reflection about the outermost pixel continues the pattern.
     padded = cv2.copyMakeBorder(values, 2, 2, 2, 2, cv2.BORDER_REFLECT_101)
@@ -104,16 +125,16 @@ def _filtered(values: Array) -> Array:
 
 
 DEMOSAIC_MODES = {"half": 2, "quarter": 4, "full": 1}
-"""Sensor pixels per picture pixel in each direction, by mode."""
+"""Number of sensor pixels per pixel of the picture in each direction, for each mode of demosaicing."""
 
 
 @dataclass(frozen=True, eq=False)
 class DemosaicedPicture:
-    """Demosaiced intensities.
+    """Result of demosaicing a raw mosaic.
 
     Attributes:
         intensities: linear intensities at 0, 45, 90 and 135 degrees, [4, h, w, 3] float32.
-        invalid: mask of pixels that use an unusable sample, [h, w].
+        invalid: mask of the pixels that were computed from an unusable sample, [h, w].
     """
 
     intensities: Array
@@ -130,28 +151,30 @@ def demosaic(
     registered: bool = True,
     colored: bool = True,
 ) -> DemosaicedPicture:
-    """Demosaic one mosaic.
+    """Compute a picture at each of the four angles from a raw mosaic.
 
-    ``half``: each 2x2 polarizer cell is one pixel; the cells of a color sensor form a Bayer picture per angle.
-    ``quarter``: each 4x4 superpixel is one pixel, the mean of its samples of an angle and color, without interpolation.
-    ``full``: every sensor pixel; colors are interpolated between cells of one angle, then angles between neighboring
-    pixels.
+    - ``half``: each polarizer cell of 2 x 2 sensor pixels becomes one pixel. The cells of a color sensor form a Bayer
+      picture for each angle, whose missing colors are interpolated.
+    - ``quarter``: each square of 4 x 4 sensor pixels becomes one pixel. Its samples of the same angle and color are
+      averaged, without interpolation.
+    - ``full``: each sensor pixel becomes one pixel. Missing colors are interpolated between cells, then missing angles
+      between neighboring pixels.
 
-    The four samples of a cell are half a cell apart. If ``registered``, ``half`` interpolates them at its center: S1
-    and S2 are means over the cell in ``full``, and so is S0 of guided interpolation. Bilinear interpolation would blur
-    S0, which is that of the cell's own samples.
+    The four samples of a cell are half a cell apart. If ``registered`` is True, the mode ``half`` interpolates all four
+    angles at the center of the cell: it averages the Stokes components of the mode ``full`` over the cell. With
+    bilinear interpolation, S0 is taken from the samples of the cell instead, because the average would blur it.
 
     Args:
         values: linear intensities [H, W] after black level and gains.
         bad: mask of unusable samples, [H, W].
         pattern: pattern of the top-left pixel, which starts a whole polarizer cell.
         mode: a key of ``DEMOSAIC_MODES``.
-        interpolation: ``bilinear`` or ``guided``; ``quarter`` and a monochrome ``half`` interpolate no colors.
-        registered: if True, ``half`` moves the four angles to one place.
-        colored: if True, a monochrome sensor gives three equal channels, else one channel.
+        interpolation: method of interpolation, ``bilinear`` or ``guided``.
+        registered: if True, the mode ``half`` interpolates all four angles at the center of each cell.
+        colored: if True, the result of a monochrome sensor has three equal channels. If False, it has one channel.
 
     Returns:
-        The picture of size ``H // s`` x ``W // s`` for s = 2, 4 or 1, without incomplete cells.
+        The picture, of size ``H // s`` x ``W // s``, where s is 2, 4 or 1. Incomplete cells are left out.
     """
     invalid = spoiled(bad, pattern, mode=mode, interpolation=interpolation, registered=registered)
     step = 4 if mode == "quarter" else 2
@@ -173,7 +196,10 @@ def demosaic(
 
 
 def spoiled(bad: Mask, pattern: Pattern, *, mode: str, interpolation: str, registered: bool = True) -> Mask:
-    """Return a mask of the pixels for which ``demosaic`` uses an unusable sample; arguments are the same."""
+    """Return a mask of the pixels that ``demosaic`` computes from an unusable sample.
+
+    ``demosaic`` describes the arguments.
+    """
     step = DEMOSAIC_MODES[mode]
     unit = 4 if mode == "quarter" else 2
     bad = bad[: bad.shape[0] // unit * unit, : bad.shape[1] // unit * unit]
@@ -190,7 +216,7 @@ def spoiled(bad: Mask, pattern: Pattern, *, mode: str, interpolation: str, regis
 
 
 def _spoiled_colors(bad: Mask, pattern: Pattern, place: tuple[int, int], interpolation: str) -> Mask:
-    """Return a mask of the colors at one place of the cells that use an unusable sample."""
+    """Return a mask of the colors that are computed from an unusable sample, for one angle of each cell."""
     row, column = place
     mask = bad[place[0] :: 2, place[1] :: 2]
     if pattern.colors is None:
@@ -206,7 +232,7 @@ def _spoiled_colors(bad: Mask, pattern: Pattern, place: tuple[int, int], interpo
 
 
 _Cells = dict[tuple[int, int], Array]
-"""Colors [H/2, W/2, C] by position (row, column) in the cell."""
+"""Picture [H/2, W/2, C] of the samples at each position (row, column) in the polarizer cells."""
 
 
 def _cells(values: Array, pattern: Pattern, interpolation: str) -> _Cells:
@@ -227,7 +253,7 @@ def _cells(values: Array, pattern: Pattern, interpolation: str) -> _Cells:
 
 
 def _full(cells: _Cells, pattern: Pattern, interpolation: str) -> Array:
-    """Interpolate angles at full size. Each channel is like the mosaic of a monochrome sensor."""
+    """Interpolate the missing angles at full size. Each color channel is treated like a monochrome mosaic."""
     height, width, channels = cells[0, 0].shape
     mosaic = np.empty((channels, 2 * height, 2 * width), np.float32)
     for (row, column), colors in cells.items():
@@ -248,7 +274,10 @@ def _full(cells: _Cells, pattern: Pattern, interpolation: str) -> Array:
 
 
 def _registered(plain: Array, full: Array, interpolation: str) -> Array:
-    """Average full-size angles over cells, so that all are at the centers of the cells."""
+    """Return the intensities of the four angles at the centers of the cells.
+
+    The full-size intensities are averaged over each cell.
+    """
     angles, height, width, channels = plain.shape
     cells = full.reshape(angles, height, 2, width, 2, channels)
     upper, lower = (cells[:, :, row, :, 0] + cells[:, :, row, :, 1] for row in (0, 1))
@@ -259,7 +288,7 @@ def _registered(plain: Array, full: Array, interpolation: str) -> Array:
 
 
 def _superpixels(values: Array, pattern: Pattern) -> Array:
-    """Average the samples of one angle and color in each 4x4 pixels."""
+    """Average the samples of the same angle and color in each square of 4 x 4 pixels."""
     repeat = 4 // pattern.period
     angles = np.tile(pattern.angles, (repeat, repeat))
     colors = None if pattern.colors is None else np.tile(pattern.colors, (repeat, repeat))
@@ -284,27 +313,40 @@ def _dilated(mask: Mask, radius: int) -> Mask:
 
 
 _BEYOND_NOISE = 6.0
-"""Threshold in standard deviations of the sensor's noise. Some of millions of samples exceed less by chance."""
+"""Smallest deviation of a defective sample, in standard deviations of the noise.
+
+Among millions of samples, noise causes smaller deviations by chance.
+"""
 _OF_LIGHT = 0.5
-"""Smallest joint rise of the analyzers at 45 degrees, relative to a rise by light. A defect causes none."""
+"""Smallest rise of the two other angles of a cell if light causes the rise of a sample, relative to that rise.
+
+A defect of the sample does not change the other angles.
+"""
 _BINS = 16
 _AGREE = 0.5
-"""Share of the views in which a defect must be an outlier. Light changes from view to view; defects do not."""
+"""Share of the mosaics in which a defective sample must be an outlier. Outliers by light differ between views."""
 _SAME_SIGN = 0.75
-"""Share of the views in which a defect must be on one side: views above minus views below."""
+"""Smallest net share of the mosaics in which a defective sample deviates in the same direction.
+
+The net share is the share of mosaics with a positive deviation minus the share with a negative deviation, or the
+reverse.
+"""
 
 
 def outliers(values: NDArray[Any], period: int) -> tuple[NDArray[np.bool_], NDArray[np.int8]]:
-    """Find the outliers of one mosaic, [H, W], and the sign of significant differences from the median of neighbors.
+    """Find the samples of a mosaic that differ strongly from their neighbors.
 
-    Neighbors are the eight nearest samples behind the same analyzer and color. A sample is an outlier if it exceeds
-    their range by more than this range and by more than noise, while the other analyzers of its cell do not change. The
-    noise
-    is that of the sensor at this brightness: the median deviation of samples from the median of their neighbors.
+    The neighbors are the eight nearest samples of the same angle and color. A sample is an outlier if its distance from
+    their range is larger than this range and larger than the noise, while the other angles of its cell do not change.
+    The noise is estimated from the mosaic as a function of brightness.
 
     Args:
         values: stored values [H, W] that start with a whole cell; sides are even.
         period: period of the pattern in pixels.
+
+    Returns:
+        The mask of the outliers; and for each sample the sign of its deviation from the median of the neighbors, which
+        is 0 if the deviation is not significant. Both are [H, W].
     """
     height, width = values.shape
     padded = np.pad(values, period, mode="reflect")
@@ -331,16 +373,19 @@ _NETWORK = (
     (0, 1), (2, 3), (4, 5), (6, 7), (0, 2), (1, 3), (4, 6), (5, 7), (1, 2), (5, 6),
     (0, 4), (1, 5), (2, 6), (3, 7), (2, 4), (3, 5), (1, 2), (3, 4), (5, 6),
 )  # fmt: skip
-"""Comparisons that sort eight values (Batcher's odd-even merge sort), faster on whole pictures than sorting pixels."""
+"""Pairs of positions whose values are compared and exchanged to sort eight values (Batcher's odd-even merge sort).
+
+Applied to whole pictures, this is faster than a sort at each pixel.
+"""
 
 
 def _noise(rise: NDArray[np.float32], middle: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return the standard deviation of the noise of each sample by brightness."""
+    """Estimate the standard deviation of the noise of each sample, which depends on its brightness."""
     step = max(1, rise.size >> 20)
     level = middle.ravel()[::step]
     deviation = np.abs(rise).ravel()[::step]
     edges = np.quantile(level, np.linspace(0, 1, _BINS + 1)).astype(np.float32)
-    # A frequent brightness, such as black, is a bin of its own, because it has no influence on the noise of others.
+    # A frequent brightness, such as black, gets a bin of its own, so it does not affect the noise of other values.
     common = edges[1:][np.diff(edges) == 0]
     edges = np.unique(np.concatenate((edges, np.nextafter(common, np.float32(np.inf)))))
     number = np.clip(np.searchsorted(edges, level, side="right") - 1, 0, max(0, len(edges) - 2))
@@ -354,7 +399,11 @@ def _noise(rise: NDArray[np.float32], middle: NDArray[np.float32]) -> NDArray[np
 
 
 def _is_isolated(rise: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Return a mask of samples whose rise is more than double the joint rise of the analyzers at 45 degrees."""
+    """Return a mask of the samples that rise alone.
+
+    The rise of such a sample is more than twice the common rise of the two angles of its cell that differ by 45
+    degrees.
+    """
     cell = [rise[row::2, column::2] for row, column in np.ndindex(2, 2)]
     # Analyzers at right angles are on the diagonals of a cell.
     others = {0: cell[1] + cell[2], 3: cell[1] + cell[2], 1: cell[0] + cell[3], 2: cell[0] + cell[3]}
@@ -366,7 +415,10 @@ def _is_isolated(rise: NDArray[np.float32]) -> NDArray[np.bool_]:
 
 
 def defects(mosaics: Iterable[NDArray[Any]], period: int) -> NDArray[np.bool_]:
-    """Return a mask [H, W] of samples that are outliers in half of the mosaics and differ in nearly all."""
+    """Return a mask [H, W] of the defective samples of a sensor.
+
+    A defective sample is an outlier in at least half of the mosaics, and deviates in the same direction in nearly all.
+    """
     votes: Any = 0
     signs: Any = 0
     count = 0
@@ -379,6 +431,6 @@ def defects(mosaics: Iterable[NDArray[Any]], period: int) -> NDArray[np.bool_]:
 
 
 def defects_note(count: int, samples: int) -> str:
-    """Return a note for the user on the number of defects among the samples of a mosaic."""
+    """Return a note for the user about the number of defective samples."""
     share = f"{count} samples ({count / samples:.3%})"
     return f"{share} differ from all similar neighbors (hot or dead pixels) and are invalid."

@@ -1,4 +1,4 @@
-"""Pattern of polarizers and color filters of a sensor, and its radiometric levels."""
+"""Patterns of polarizers and color filters on sensors, and levels of the stored values, such as full scale."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ _BAYER = np.array([[0, 1], [1, 2]])  # R G / G B, one entry per polarizer cell
 
 Sensor = Literal["IMX250MYR", "IMX250MZR", "IMX253MYR", "IMX253MZR", "IMX264MYR", "IMX264MZR"]
 SENSORS: dict[str, bool] = {name: name.endswith("MYR") for name in get_args(Sensor)}
-"""Sony sensors by name; True for color sensors. All color sensors have one pattern, all monochrome sensors another."""
+"""Supported Sony sensors by name. The value is True for a color sensor, and False for a monochrome sensor."""
 SENSOR_NAMES = (
     "IMX250MYR, IMX253MYR, IMX264MYR (color), IMX250MZR, IMX253MZR, IMX264MZR (monochrome), a camera's model"
 )
-"""Names of the sensors for the user."""
+"""List of the supported sensors for messages."""
 SENSOR_SIZES = {name: (4112, 3008) if "253" in name else (2464, 2056) for name in SENSORS}
-"""Width and height in pixels. Cameras deliver somewhat less, such as 2448 x 2048."""
+"""Width and height of each sensor in pixels. The pictures of cameras are slightly smaller, such as 2448 x 2048."""
 
 _CAMERAS: dict[str, Sensor] = {
     "PHX050S-P": "IMX250MZR", "TRI050S-P": "IMX250MZR", "BFS-U3-51S5P": "IMX250MZR", "BFS-PGE-51S5P": "IMX250MZR",
@@ -37,17 +37,23 @@ _CAMERAS: dict[str, Sensor] = {
     "BFS-PGE-123S6P": "IMX253MZR",
     "PHX050S1-P": "IMX264MZR", "TRI050S1-P": "IMX264MZR", "PHX050S1-Q": "IMX264MYR", "TRI050S1-Q": "IMX264MYR",
 }  # fmt: skip
-"""Sensors by the maker's model name of a camera. Up to three letters for mount or interface may follow."""
+"""Sensor of each camera by the model name of the camera.
+
+Up to three letters for the lens mount or the interface may follow the name.
+"""
 _MOUNT = re.compile(r"-?[A-Z0-9]{0,3}")
 
 
 def _normalized(name: str) -> str:
-    """Convert a name to capitals, with hyphens instead of blanks."""
+    """Convert a name to upper case, and replace blanks by hyphens."""
     return re.sub(r"[\s_]+", "-", name.strip()).upper()
 
 
 def sensor_named(name: str) -> str:
-    """Return the sensor of a sensor's name or a camera's model, with or without its maker; other names unchanged."""
+    """Return the name of a sensor, given the name of the sensor or the model of a camera.
+
+    The maker may precede the model. Any other name is returned unchanged.
+    """
     full = _normalized(name)
     # The longest match: BFS-U3-51S5PC is not BFS-U3-51S5P with the mount C.
     models = sorted(_CAMERAS, key=len, reverse=True)
@@ -63,7 +69,7 @@ def sensor_named(name: str) -> str:
 
 
 def require_sensor(name: str | None) -> None:
-    """Refuse a name that is not a sensor's.
+    """Refuse a name that is not the name of a supported sensor.
 
     Raises:
         PolarguideError: the name is unknown.
@@ -80,7 +86,10 @@ def require_sensor(name: str | None) -> None:
 
 
 def any_case(*names: str) -> PrimitiveConstructorSpec[Any]:
-    """Create the command-line parser of names, including camera models. The settings check the result."""
+    """Create the command-line parser for the name of a sensor or the model of a camera.
+
+    The parser accepts any text. The options check the name later.
+    """
     return PrimitiveConstructorSpec(
         nargs=1,
         metavar=f"{{{','.join(names)}}}",
@@ -93,7 +102,7 @@ def any_case(*names: str) -> PrimitiveConstructorSpec[Any]:
 SensorName = Annotated[Sensor, any_case(*SENSORS)]
 
 Packing = Literal["8", "16", "16be", "10p", "10packed", "10mipi", "12p", "12packed", "12mipi"]
-"""Layout of values in ``.raw`` files, see ``sensor.raw_file.PACKINGS``."""
+"""Name of the layout of pixel values in ``.raw`` files, see ``sensor.raw_file.PACKINGS``."""
 
 
 NotNegative = Annotated[int, Meta(ge=0, le=1 << 20)]
@@ -130,11 +139,11 @@ class MosaicOptions:
 
 @dataclass(frozen=True, eq=False)
 class Pattern:
-    """Repeating pattern of a sensor or of a region of it.
+    """Repeating pattern of polarizers and color filters on a sensor.
 
     Attributes:
         angles: polarizer angle of each pixel in degrees, [4, 4] for a color sensor, [2, 2] for a monochrome sensor.
-        colors: 0, 1, 2 for R, G, B in the same shape; None for a monochrome sensor.
+        colors: color of each pixel, 0, 1 or 2 for R, G or B, [4, 4]; None for a monochrome sensor.
     """
 
     angles: NDArray[np.int64]
@@ -142,20 +151,21 @@ class Pattern:
 
     @property
     def period(self) -> int:
-        """Period of the pattern in pixels: 4 or 2."""
+        """Period of the pattern in pixels: 4 for a color sensor, 2 for a monochrome sensor."""
         return int(self.angles.shape[0])
 
     def shifted(self, x: int, y: int) -> Pattern:
-        """Return the pattern of a region whose top-left pixel is column ``x``, row ``y`` of this one."""
+        """Return the pattern of a region that starts at column ``x`` and row ``y`` of this pattern."""
         return Pattern(
             np.roll(self.angles, (-y, -x), axis=(0, 1)),
             None if self.colors is None else np.roll(self.colors, (-y, -x), axis=(0, 1)),
         )
 
     def cell_corner(self) -> tuple[int, int]:
-        """Return the number of columns and rows before the first whole polarizer cell of one color.
+        """Return the column and the row at which the first whole polarizer cell starts.
 
-        They are zero for a monochrome pattern, because any 2x2 pixels have all four angles.
+        A cell is a square of 2 x 2 pixels with one color and all four angles. Both numbers are zero for a monochrome
+        pattern, because any 2 x 2 pixels have all four angles.
         """
         if self.colors is None:
             return 0, 0
@@ -172,13 +182,13 @@ class Pattern:
 
 
 def tiled(pattern: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:
-    """Repeat a pattern over [H, W]."""
+    """Repeat a pattern to fill an array of shape [H, W]."""
     repeat = [-(-length // period) for length, period in zip(shape, pattern.shape, strict=True)]
     return np.tile(pattern, repeat)[: shape[0], : shape[1]]
 
 
 def sensor_pattern(sensor: str) -> Pattern:
-    """Return the pattern of a whole sensor from its top-left pixel.
+    """Return the pattern of a sensor, starting at the top-left pixel of the sensor.
 
     Raises:
         PolarguideError: the sensor is unknown.
@@ -190,16 +200,16 @@ def sensor_pattern(sensor: str) -> Pattern:
 
 
 FULL_16 = (1 << 16) - 1
-"""Largest value of 16-bit files."""
+"""Largest value of a pixel in 16-bit files."""
 
 
 @dataclass(frozen=True)
 class Levels:
-    """Radiometric levels of a capture, in stored values.
+    """Levels that relate the stored values of a capture to linear intensities.
 
     Attributes:
-        bits: bits of a sensor value.
-        white: stored value of linear 1.
+        bits: number of bits of a sensor value.
+        white: stored value of the linear intensity 1.
         saturation: smallest stored value of a saturated sample.
         black: stored value without light.
         gamma: exponent of the stored values: stored = linear ^ gamma.
@@ -212,15 +222,18 @@ class Levels:
     gamma: float = 1.0
 
     def is_full(self, container: int) -> bool:
-        """Return True if values fill all ``container`` bits of the file and saturate at full scale."""
+        """Return True if the values use all ``container`` bits of the file, and saturate at the largest value."""
         return self.bits == container and self.saturation == self.white
 
     def linear(self, values: NDArray[Any], dark: NDArray[np.float32] | None = None) -> NDArray[np.float32]:
-        """Return (value - black) / (white - black), made linear, float32. Noise below black stays negative.
+        """Convert stored values to linear intensities, float32.
+
+        The result is ``(value - black) / (white - black)`` without the gamma. Noise below the black level gives
+        negative intensities.
 
         Args:
             values: stored values, [..., H, W].
-            dark: dark frame in stored values, in the same shape, instead of the black level.
+            dark: dark frame in stored values, in the shape of ``values``. It replaces the black level.
         """
         floor = np.float32(self.black) if dark is None else dark
         scaled = ((values.astype(np.float32) - floor) / np.float32(self.white - self.black)).astype(
@@ -243,25 +256,27 @@ def estimate_levels(
     stated: int | None = None,
     alone: bool = False,
 ) -> Levels:
-    """Estimate the full scale of a capture.
+    """Estimate the levels of the stored values of a capture.
 
-    Without ``bits``, the files' full scale applies, or 8 bits for 8-bit files. In 16-bit files the bits are those of
-    the value at which samples pile up, else 12 if no value exceeds 4095 (the sensors' converters have 12 bits), else
-    16. If low bits are never used (12 bits shifted to the top of 16), full scale is the largest possible value.
+    The full scale follows from ``bits``, or from the headers of the files. Otherwise 8-bit files have 8 bits, and the
+    number of bits of 16-bit files is estimated. If many samples are clipped at one value, this value gives the number.
+    If no value exceeds 4095, it is 12, because the converters of the sensors have 12 bits. In all other cases it is 16.
+    If the low bits are never used, the values were shifted to the top of the 16 bits. The full scale is then the
+    largest possible value.
 
     Args:
         largest: largest stored value of the capture.
         used: bitwise or of all stored values.
-        container: bits of the files' values, or of a packed pixel.
-        bits: bits of a sensor value, or None.
-        black: black level in stored values.
-        saturation: stored value at which the sensor saturates, or None for full scale.
-        counts: histogram of the stored values from 0.
-        stated: full scale in the files' headers, or None.
-        alone: True for a single shot of a series, in which piled-up values do not imply the full scale.
+        container: number of bits of a value in the files, or of a packed pixel.
+        bits: number of bits of a sensor value, or None if it is unknown.
+        black: stored value without light.
+        saturation: stored value at which the sensor saturates; None if it saturates at full scale.
+        counts: number of occurrences of each stored value, starting at the value 0.
+        stated: full scale in the headers of the files, or None.
+        alone: True for a single shot of a series. Clipped values of one shot do not determine the full scale.
 
     Raises:
-        PolarguideError: a value exceeds the range, or the levels are not in order.
+        PolarguideError: a stored value exceeds the full scale, or the levels contradict each other.
     """
     stated = stated if bits is None else None
     clipped = None if counts is None or container != 16 else clipping_bits(counts)
@@ -293,10 +308,10 @@ def estimate_levels(
 
 
 def agreed_full_scale(stated: Mapping[Path, int | None]) -> int | None:
-    """Return the full scale that all files of a capture state; None if they state none.
+    """Return the full scale that all files of a capture state. Return None if no file states it.
 
     Raises:
-        PolarguideError: two files differ.
+        PolarguideError: two files state different values.
     """
     (first, full), *others = stated.items()
     for path, other in others:
@@ -320,12 +335,13 @@ _BESIDE = 50  # the compared values are smaller by up to a fiftieth
 
 
 def clipping_bits(counts: NDArray[np.int64]) -> int | None:
-    """Return the bits of a sensor with a pile of clipped samples at the largest value of 16-bit files, or None.
+    """Return the number of bits of a sensor if clipped samples in 16-bit files show it. Otherwise return None.
 
-    A converter of b bits clips at 2^b - 1. A pile at another value may be a bright surface.
+    A converter of b bits clips at the value 2^b - 1, so many samples have this value. Many samples with another value
+    may show a bright surface.
 
     Args:
-        counts: histogram of the stored values from 0.
+        counts: number of occurrences of each stored value, starting at the value 0.
     """
     occurring = np.flatnonzero(counts)
     top = int(occurring[-1]) if len(occurring) else 0
@@ -343,7 +359,7 @@ def level_notes(
     bits: int | None,
     stated: int | None = None,
 ) -> list[str]:
-    """Return notes for the user on estimated levels; for ``bits`` and ``stated`` see ``estimate_levels``."""
+    """Return notes for the user about estimated levels. ``estimate_levels`` describes ``bits`` and ``stated``."""
     notes = []
     if bits is None and stated is not None:
         notes.append(f"{levels.white} is full scale according to the files (change with --bits).")
@@ -366,19 +382,19 @@ def level_notes(
 def unusable_samples(
     values: NDArray[Any], levels: Levels, dark: NDArray[np.float32] | None = None
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return masks of saturated and dark samples of a mosaic that starts with a whole polarizer cell.
+    """Find the saturated and the dark samples of a mosaic. The mosaic must start with a whole polarizer cell.
 
-    A sample is saturated from ``levels.saturation``. It is dark if it is clipped at 0 below a black level, or if no
-    sample of its 2x2 cell exceeds black: then there is no light whose polarization could be measured. A single black
-    angle next to brighter ones is valid, because surfaces at Brewster's angle look like this.
+    A sample is saturated if its value is at least ``levels.saturation``. It is dark if it is clipped at 0 below the
+    black level. All samples of a 2 x 2 cell are dark if none of them exceeds the black level, because there is no light
+    with a polarization. A single black sample in a brighter cell is valid: a surface at Brewster's angle looks so.
 
     Args:
-        values: stored values [H, W], H and W even.
-        levels: levels of the capture.
-        dark: dark frame in stored values, [H, W].
+        values: stored values [H, W]; H and W are even.
+        levels: levels of the stored values.
+        dark: dark frame in stored values, [H, W], or None.
 
     Returns:
-        Two masks [H, W].
+        The mask of saturated samples, and the mask of dark samples, [H, W] each.
     """
     height, width = values.shape
     floor = np.float32(levels.black) if dark is None else dark
@@ -391,40 +407,43 @@ def unusable_samples(
 
 Kind = Literal["color", "monochrome"]
 SIDE = 8
-"""Side of the compared blocks in pixels: 4 x 4 cells of polarizers."""
+"""Side of the blocks by which color filters are detected, in pixels. A block has 4 x 4 polarizer cells."""
 _FEWEST = 100
 _DIFFERENT = 0.02
-"""Median second difference of cells relative to their mean, above which there are color filters."""
+"""Median second difference of cells, relative to their mean, above which the sensor has color filters."""
 _EQUAL = 0.006
-"""Median second difference of cells relative to their mean, below which there are no color filters."""
+"""Median second difference of cells, relative to their mean, below which the sensor has no color filters."""
 _STRONGER = 1.5
-"""Ratio of typical differences across filters to those within one, above which there are color filters."""
+"""Ratio of the differences between cells of different colors to those within a color for a sensor with color filters.
+
+A larger ratio than this one shows color filters.
+"""
 _ALIKE = 1.35
-"""Ratio of these differences below which there are no color filters."""
+"""Ratio of the differences as in ``_STRONGER`` below which the sensor has no color filters."""
 _SMALL = 0.004
-"""Smallest relative difference above noise."""
+"""Smallest relative difference that noise does not cause."""
 
 
 def color_filters(blocks: NDArray[Any], saturation: float, floor: float = 0.0) -> Kind | None:
-    """Detect whether 2x2 cells of polarizers are behind a Bayer pattern of color filters.
+    """Detect from a mosaic whether the polarizer cells of the sensor have color filters.
 
-    The sum over a cell's four angles measures light regardless of polarization. In a Bayer pattern two of four cells
-    are green, along one diagonal; red and blue alternate along the other. Second differences remove the gradients of
-    the picture. With color filters they are large and have the same sign everywhere. Without color filters they are
-    small, equal along both diagonals, and have no sign.
+    The sum over the four angles of a cell does not depend on the polarization. In a Bayer pattern, the two cells along
+    one diagonal are green, and the cells along the other diagonal are red and blue. Second differences of the sums
+    remove gradients of the picture. With color filters, they are large and have the same sign everywhere. Without color
+    filters, they are small, equal along both diagonals, and have random signs.
 
     Args:
-        blocks: stored values [N, 8, 8] that start with a cell.
+        blocks: stored values [N, 8, 8] of blocks that start with a whole cell.
         saturation: smallest stored value of a saturated sample.
         floor: stored value without light.
 
     Returns:
-        The kind of sensor; None if samples are too few, too dark, or gray behind balanced filters.
+        The kind of sensor. It is None if there are too few bright samples, or if all colors have equal values.
     """
     lit = (blocks < saturation).all(axis=(1, 2))
     cells = blocks[lit].reshape(-1, 4, 2, 4, 2).sum(axis=(2, 4), dtype=np.float64) - 4 * floor
     mean = cells.mean(axis=(1, 2))
-    # Dark cells are dominated by read-out noise.
+    # Read-out noise dominates dark cells.
     bright = mean > 4 * (saturation - floor) / 200
     if bright.sum() < _FEWEST:
         return None
@@ -441,7 +460,9 @@ def color_filters(blocks: NDArray[Any], saturation: float, floor: float = 0.0) -
 
 
 def require_kind(sensor: str, blocks: NDArray[Any], levels: Levels) -> None:
-    """Refuse mosaics of the other kind of sensor. No later step would detect this mistake.
+    """Refuse mosaics of a color sensor if the user specified a monochrome sensor, and the reverse.
+
+    No later step would detect this mistake.
 
     Args:
         sensor: name of the sensor, a key of ``SENSORS``.

@@ -1,4 +1,4 @@
-"""Read raw mosaics from pictures, arrays, and files with packed pixels of GenICam and GigE Vision."""
+"""Read raw mosaics from pictures, arrays, and files with packed pixels of industrial cameras."""
 
 from __future__ import annotations
 
@@ -25,23 +25,25 @@ PACKINGS: dict[Packing, tuple[int, int, int]] = {
     "10p": (5, 4, 10), "10packed": (3, 2, 10), "10mipi": (5, 4, 10),
     "12p": (3, 2, 12), "12packed": (3, 2, 12), "12mipi": (3, 2, 12),
 }  # fmt: skip
-"""Bytes per group, pixels per group and bits per pixel by packing."""
+"""Number of bytes per group, of pixels per group and of bits per pixel for each packing."""
 
 
 def packed_size(width: int, height: int, packing: Packing) -> int:
-    """Return the number of bytes of a packed picture. Rows have no padding; the last group is filled up."""
+    """Return the number of bytes of a packed picture. Rows have no padding, but the last group of pixels may have."""
     group, pixels, _ = PACKINGS[packing]
     return -(-width * height // pixels) * group
 
 
 def unpack(data: bytes, width: int, height: int, packing: Packing) -> NDArray[Any]:
-    """Unpack a picture.
+    """Convert the bytes of a packed picture to pixel values.
 
-    ``8`` and ``16`` are whole bytes, the low one first, ``16be`` the high one. ``10p`` and ``12p`` are little-endian
-    bit streams, low bits first: bit b of pixel k is bit ``bits * k + b`` of the file (GenICam PFNC). The others have
-    the high eight bits of each pixel in a byte. In ``10packed`` and ``12packed`` (GigE Vision) these are bytes 0 and 2
-    of two pixels; the low bits of the first are the lowest of byte 1, those of the second begin at its bit 4. In
-    ``10mipi`` and ``12mipi`` (MIPI CSI-2) the last byte of a group has the low bits of its pixels in turn.
+    - ``8``, ``16`` and ``16be``: a pixel takes one or two bytes. ``16`` has the low byte first, ``16be`` the high byte.
+    - ``10p`` and ``12p`` (GenICam PFNC): the file is a bit stream with low bits first. Bit b of pixel k is bit
+      ``bits * k + b`` of the file.
+    - ``10packed`` and ``12packed`` (GigE Vision): two pixels take three bytes. Bytes 0 and 2 have the high eight bits
+      of the two pixels. The low bits of the first pixel start at bit 0 of byte 1, and those of the second at bit 4.
+    - ``10mipi`` and ``12mipi`` (MIPI CSI-2): each pixel of a group has a byte with its high eight bits. The last byte
+      of the group has the low bits of all of its pixels, one after the other.
 
     Args:
         data: exactly ``packed_size`` bytes.
@@ -49,7 +51,7 @@ def unpack(data: bytes, width: int, height: int, packing: Packing) -> NDArray[An
         packing: a key of ``PACKINGS``.
 
     Returns:
-        Values [height, width] from 0 to 2^bits - 1, uint16 except for ``8``.
+        Values [height, width] from 0 to 2^bits - 1. The type is uint8 for the packing ``8``, otherwise uint16.
     """
     group, pixels, bits = PACKINGS[packing]
     if pixels == 1:
@@ -75,14 +77,14 @@ RAW_SUFFIXES = (".png", ".tif", ".tiff", ".bmp", ".pgm", ".npy", ".raw")
 
 @dataclass(frozen=True)
 class RawFormat:
-    """Size and packing of a packed file, which does not contain them. Other files need none."""
+    """Picture size and packing that the user specifies for ``.raw`` files, which have no header."""
 
     width: int | None = None
     height: int | None = None
     packing: Packing | None = None
 
     def container(self, path: Path, kind: np.dtype[Any]) -> int:
-        """Return the bits that a pixel of type ``kind`` takes in a file."""
+        """Return the number of bits that a pixel takes in a file. ``kind`` is the type of its values after reading."""
         packing = self.packing if path.suffix.lower() == ".raw" else None
         return kind.itemsize * 8 if packing is None else PACKINGS[packing][2]
 
@@ -99,8 +101,8 @@ def read_mosaic(path: Path, raw: RawFormat, *, least: int = 1) -> NDArray[Any]:
 
     Args:
         path: a PNG, TIFF, ``.npy`` or packed ``.raw`` file.
-        raw: size and packing of a ``.raw`` file; other files must have this size as well.
-        least: smallest length of the shorter side in pixels.
+        raw: size and packing of a ``.raw`` file. If a size is specified, other files must have it, too.
+        least: smallest length of the shorter side in pixels that is accepted.
 
     Returns:
         Stored values [H, W], uint8 or uint16.
@@ -116,10 +118,10 @@ def read_mosaic(path: Path, raw: RawFormat, *, least: int = 1) -> NDArray[Any]:
 
 
 def require_mosaic(where: Path | str, values: NDArray[Any], *, least: int) -> None:
-    """Refuse values [H, W] that no sensor delivers; ``least`` is the smallest length of the shorter side.
+    """Refuse values [H, W] that are not a raw mosaic. ``least`` is the smallest length of the shorter side.
 
     Raises:
-        PolarguideError: the mosaic is too small, or consists of four pictures.
+        PolarguideError: the picture is too small, or shows four small pictures in a grid.
     """
     require(
         min(values.shape) >= least,
@@ -185,19 +187,23 @@ def _read_packed(path: Path, data: bytes, raw: RawFormat) -> NDArray[Any]:
 
 
 _CELLS = 4
-"""Side of the blocks in pixels. Their means do not depend on analyzers and colors on any sensor."""
+"""Side of the blocks whose means are compared, in pixels. Each block has all angles and colors of any sensor."""
 _LEAST_BLOCKS = 8
-"""Smallest number of blocks along a quarter of the picture; fewer correlate by chance."""
+"""Smallest number of blocks along a side of a quarter of the picture. Fewer blocks may correlate by chance."""
 _MOST_BLOCKS = 128
-"""Largest number of compared blocks along a quarter."""
+"""Largest number of blocks along a side of a quarter of the picture that are compared."""
 _TILED = 0.4
-"""Correlation of the detail of all quarters with the first: over 0.55 for one view, up to 0.2 for other pictures."""
+"""Correlation of the detail of the quarters above which they show the same view.
+
+The correlation is more than 0.55 for four pictures of one view, and at most 0.2 for other pictures.
+"""
 
 
 def is_tiled(values: NDArray[Any]) -> bool:
-    """Return True if a picture shows the same view four times, in two rows of two, as cameras display separate angles.
+    """Return True if a picture consists of four small pictures of the same view, in two rows of two.
 
-    The detail (block means minus the means of neighboring blocks) of each quarter is correlated with the first.
+    Some cameras display the four angles in this way. The detail of each quarter is correlated with that of the first
+    quarter. The detail is the mean of each block minus the mean of the neighboring blocks.
     """
     down, across = (min(side // 2 // _CELLS, _MOST_BLOCKS) for side in values.shape)
     if min(down, across) < _LEAST_BLOCKS:
@@ -218,15 +224,16 @@ def is_tiled(values: NDArray[Any]) -> bool:
 
 
 _APART = 4
-"""Distance in pixels at which analyzer and color are the same on every sensor."""
+"""Distance in pixels between samples that have the same angle and color on every sensor."""
 _ROUGHER = 2.0
-"""Ratio of roughness between two packings above which the rougher one is wrong."""
+"""Ratio of the roughness of two packings above which the packing with the larger roughness is wrong."""
 
 
 def _worst_roughness(values: NDArray[Any]) -> float:
-    """Return the roughness of the even or odd columns, whichever is larger. A wrong packing may affect only one.
+    """Measure the roughness of the even columns and of the odd columns, and return the larger value.
 
-    Roughness is the mean difference of neighbors behind one analyzer, relative to that of unrelated samples.
+    Roughness is the mean difference of neighboring samples of one angle, relative to the mean difference of any two
+    samples. A wrong packing may affect only the even or only the odd columns.
     """
     return max(_roughness(values[:, column::2]) for column in (0, 1))
 
@@ -248,10 +255,10 @@ def _roughness(columns: NDArray[Any]) -> float:
 
 
 def _require_smooth(path: Path, data: bytes, values: NDArray[Any], packing: Packing) -> None:
-    """Refuse a packing or a size that gives noise, if another one of the same data gives a picture.
+    """Refuse a packing or a size with which the data look like noise, if they look like a picture with another one.
 
     Raises:
-        PolarguideError: another packing or size is right.
+        PolarguideError: another packing or size gives a smoother picture.
     """
     height, width = values.shape
     others: dict[str, tuple[int, int, Packing]] = {
@@ -263,7 +270,7 @@ def _require_smooth(path: Path, data: bytes, values: NDArray[Any], packing: Pack
         others[f"--width {height} --height {width}"] = (height, width, packing)
     own = _worst_roughness(values)
     rough = {options: _worst_roughness(unpack(data, *other)) for options, other in others.items()}
-    # The smoothest one, because two packings that differ only in the low bits are both smooth.
+    # The smoothest packing is suggested, because two packings that differ only in the low bits are both smooth.
     for options in sorted(rough, key=lambda options: rough[options])[:1]:
         require(
             not own > _ROUGHER * rough[options] > 0,
