@@ -30,7 +30,7 @@ from polarguide.geometry.polarizer import ANGLES
 
 Dataset = Literal["pandora", "pisr", "nersp", "neisf", "gnerp", "phygap"]
 ORIGINS = ("auto", "dataset", "sfm", "none")
-"""Values of ``poses`` that are not paths."""
+"""Allowed values of the setting ``poses``, apart from paths."""
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ _KINDS: dict[str, type[GainOptions]] = {
 }
 """Types of settings by the names of the sources in messages."""
 _NAMES = {"mosaic": "raw mosaics", "filter": "rotating filters", "singles": "single shots"}
-"""Names of formats in messages, where they differ from the formats."""
+"""Names of formats in messages, for formats whose names are not clear to users."""
 
 
 @dataclass(frozen=True)
@@ -231,10 +231,10 @@ class CalibrationOptions:
 
 
 def settings_of_format(settings: PrepareSettings, kind: str) -> GainOptions:
-    """Return the settings that apply to a format, as the type of that format.
+    """Return the settings that apply to a format, as the settings type of that format.
 
     Raises:
-        PolarguideError: another setting differs from its default.
+        PolarguideError: a setting that does not apply differs from its default.
     """
     owner = _KINDS.get(_NAMES.get(kind, kind), GainOptions)
     for name, owners in sorted(misplaced(settings, owner, _KINDS)):
@@ -264,10 +264,12 @@ def settings_of_format(settings: PrepareSettings, kind: str) -> GainOptions:
 
 
 def white_gains(text: str) -> tuple[float, float, float] | None:
-    """Parse the gains of R, G and B from ``--white-balance``; None for "gray", which needs the pictures.
+    """Parse the gains of R, G and B from ``--white-balance``.
+
+    Return None for "gray", whose gains are measured in the pictures.
 
     Raises:
-        PolarguideError: the text has another form.
+        PolarguideError: the text is invalid.
     """
     if text in ("none", "gray", "grey"):
         return (1.0, 1.0, 1.0) if text == "none" else None
@@ -283,10 +285,14 @@ def white_gains(text: str) -> tuple[float, float, float] | None:
 
 
 def known_intrinsics(text: str) -> tuple[str, tuple[float, ...]]:
-    """Parse COLMAP's camera model and parameters from ``--intrinsics``: PINHOLE with four numbers, OPENCV with eight.
+    """Parse the camera intrinsics in ``--intrinsics``.
+
+    Returns:
+        The name of COLMAP's camera model; and its parameters. The model is PINHOLE for four numbers, and OPENCV for
+        eight.
 
     Raises:
-        PolarguideError: the text has another form.
+        PolarguideError: the text is invalid.
     """
     numbers = decimals(text)
     if len(numbers) not in (4, 8) or not all(map(math.isfinite, numbers)) or min(numbers[:4]) <= 0:
