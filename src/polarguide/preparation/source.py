@@ -296,7 +296,10 @@ class StokesSource(Source):
         )
 
     def develop(self, view: str, measured: StokesMeasured) -> DevelopedView:
-        """Read and scale the Stokes vectors of a view, compute the four intensities, and correct the angles' direction."""
+        """Read and scale the Stokes vectors of a view, and compute its four intensities.
+
+        The direction of the angles is corrected.
+        """
         stokes, finite, clipped = self._stokes(view)
         intensities = np.stack(four_intensities(stokes * np.float32(measured.scale)))
         # Rounding of the scale can move the largest intensity slightly above 1.
@@ -528,7 +531,10 @@ class MosaicSource(Source):
         )
 
     def _defects(self, levels: Levels) -> NDArray[np.bool_]:
-        """Return a mask of defective samples. The mosaic is cropped to whole cells, and saturated samples do not count."""
+        """Return a mask of defective samples.
+
+        The mosaic is cropped to whole cells of the pattern. Saturated samples do not count as defects.
+        """
         if self._defective is None:
             files = list(self._files.values())
             sample = files[:: max(1, math.ceil(len(files) / _JUDGED))]
