@@ -64,10 +64,9 @@ def positions(calibration: AnalyzerCalibration) -> list[Position]:
 
 
 def effect(calibration: AnalyzerCalibration) -> tuple[float, float]:
-    """Return two values of the DoLP that the sensor measures without correction: for unpolarized and for polarized light.
+    """Return the DoLP that the sensor measures without correction, for unpolarized and for fully polarized light.
 
-    Both are medians over the blocks. The second is for fully polarized light, and also a median over the angles of the
-    light.
+    Both values are medians over the blocks. The second value is also a median over the angles of the light.
     """
     pattern = calibration.pattern
     vectors = calibration.vectors.astype(np.float64)

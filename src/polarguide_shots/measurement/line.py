@@ -305,7 +305,7 @@ class Line(contextlib.AbstractContextManager["Line"]):
         return self.table.add(unread_entry(shot, files, error))
 
     def _draw(self, shot: ExposureSet, measured: MeasuredShot) -> str:
-        """Write the pictures of a shot, and return the name of the files. The name is empty if there are no pictures."""
+        """Write the pictures of a shot, and return the name of the files, which is empty without pictures."""
         reference = self.measurer.reference
         if not measured.beyond and reference is None:
             return ""

@@ -47,7 +47,7 @@ _LOST = {reason.name.lower(): reason for reason in Reason if reason != Reason.US
 _OF_NO_PIXEL = ("_error", "_deviation", "_share", "_concentration")
 """Endings of the names of fields whose limits apply to regions, not to single pixels."""
 _SPECKLE = 5
-"""Side of the median filter that removes speckle from outlines, because interpolation spreads noise over three pixels."""
+"""Side of the median filter that removes speckle from outlines. Interpolation spreads noise over three pixels."""
 
 
 def regions_picture(

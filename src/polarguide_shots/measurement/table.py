@@ -374,7 +374,7 @@ class Table(contextlib.AbstractContextManager["Table"]):
         return self._done.get(_key(files))
 
     def picture_name(self, shot: str) -> str:
-        """Return a new name for the pictures of a shot. It is unique even if upper and lower case are not distinguished."""
+        """Return a new name for the pictures of a shot. It is unique even if case is ignored."""
         names = itertools.chain((shot,), (f"{shot}-{number}" for number in itertools.count(2)))
         return next(name for name in names if name.casefold() not in self._pictures)
 
