@@ -169,7 +169,9 @@ def behind_filter(stokes: Array, rays: Array, degrees: float) -> Array:
 def filter_jpeg(
     stokes: Array, rays: Array, shot: FilterShot, noise: float, random: np.random.Generator, sensor: Sensor
 ) -> bytes:
-    """Return the JPEG file that a camera would store. It has noise, sRGB encoding and 8 bits, and is rotated like the camera.
+    """Return the JPEG file that a camera would store, with noise, sRGB encoding and 8 bits.
+
+    The picture is rotated like the camera.
 
     Args:
         stokes: Stokes vectors [3, H, W, 3] of the upright picture in the lens frame, full scale 1.

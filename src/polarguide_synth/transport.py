@@ -20,7 +20,7 @@ from polarguide_synth.settings import dr, mi
 
 
 def opaque_value(kind: Any, value: float) -> Any:
-    """Convert a number to a type of Mitsuba that is not compiled into the kernel, so that all views share one kernel."""
+    """Convert a number to a type of Mitsuba without compiling it into the kernel. All views then share one kernel."""
     return kind(value) if mi.variant().startswith("scalar") else dr.opaque(kind, value)
 
 
