@@ -69,9 +69,9 @@ def priors(
         hint = " With --formats it applies to the maps." if given[0] in _OF_MAPS else ""
         raise PolarguideError(
             shots.label(given[0]),
-            expected="shots",
+            expected="single shots, to which the option applies",
             found="a scene with poses",
-            remedy=f"Leave it out: the scene has developed pictures and cameras.{hint}",
+            remedy=f"Remove the option, because a scene contains pictures and cameras that are ready to use.{hint}",
         )
     refuse_scene(Path(out))
     loaded = scene if isinstance(scene, Scene) else read_scene(scene, reading, reporter)

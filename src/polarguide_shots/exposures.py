@@ -61,7 +61,7 @@ def find_shots(
     """
     options = options or ShotOptions()
     require(
-        paths, "paths", expected="at least one file or folder of shots", found="none", remedy="Name some."
+        paths, "paths", expected="at least one file or folder of shots", found="none", remedy="Specify some paths."
     )
     shots = list_shots(paths, options)
     faults = [shot.fault for shot in shots if shot.empty and shot.fault is not None]
@@ -300,7 +300,7 @@ def _unique_names(shots: list[ExposureSet]) -> list[ExposureSet]:
                 shot.paths[0],
                 expected="one shot of each name",
                 found=f"{shot.name} also at {others[0].paths[0]}",
-                remedy="Rename one of them, or give them in two calls.",
+                remedy="Rename one of the shots, or read them in separate calls.",
             )
             unique[place] = replace(shot, fault=shot.fault or fault)
     return unique

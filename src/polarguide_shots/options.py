@@ -78,9 +78,9 @@ class ShotOptions(RawOptions):
         require(
             not self.read_noise or self.full_well is not None,
             "--read-noise",
-            expected="--full-well next to it; without it, the noise is estimated from each shot",
+            expected="--full-well together with --read-noise",
             found=f"{self.read_noise:g} without --full-well",
-            remedy="Give --full-well, or leave it out.",
+            remedy="Specify --full-well as well, or remove --read-noise: the noise is then estimated from each shot.",
         )
         return self
 
@@ -105,16 +105,16 @@ class ShotOptions(RawOptions):
             hint = " Raw mosaics need --sensor." if owners == ["raw mosaics"] and self.sensor is None else ""
             raise PolarguideError(
                 self.label(option),
-                expected=f"{' and '.join(owners)}, which the option applies to",
+                expected=f"{' and '.join(owners)}, to which the option applies",
                 found=f"{name}, {singular}",
-                remedy=f"Leave it out; it has no effect there.{hint}",
+                remedy=f"Remove the option, because it would have no effect.{hint}",
             )
         require(
             kind != "scene" or self.calibration.gains is None,
             "calibration (gains)",
-            expected="raw mosaics and shots through a filter, which gains apply to",
+            expected="raw mosaics and shots through a filter, to which gains apply",
             found=f"{name}, {singular}",
-            remedy="Leave the gains out; order, sense and zero apply. prepare --calibration corrects a scene.",
+            remedy="Remove the gains; order, sense and zero apply. prepare --calibration corrects gains.",
         )
 
 

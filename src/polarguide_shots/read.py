@@ -154,7 +154,7 @@ def read_shot(
             paths[0],
             expected="one shot",
             found=f"{len(shots)}",
-            remedy="find_shots lists them; read them one by one.",
+            remedy="Find the shots with find_shots, and read each separately.",
         )
         shot = shots[0]
     if shot.fault is not None:
@@ -448,7 +448,7 @@ def array_shot(
         name,
         expected="integers with srgb=True",
         found=kind_of(values),
-        remedy="Leave srgb out: floats are linear.",
+        remedy="Remove srgb=True, because floats are linear.",
     )
     stored = stored_pictures(values, name)
     exposures_of(angles, len(stored), f"{name} (angles)")
@@ -507,7 +507,7 @@ def _mosaic(values: NDArray[Any], options: ShotOptions, name: str) -> NDArray[An
         name,
         expected=f"{size[0]}x{size[1]} pixels according to width and height",
         found=f"{width}x{height}",
-        remedy="Leave the two options out: an array has a size.",
+        remedy="Remove width and height, because the array has a size of its own.",
     )
     return np.ascontiguousarray(values)
 
@@ -761,9 +761,10 @@ def _filter(shot: ExposureSet, options: ShotOptions) -> Developed:
 
 
 def _read_view(shot: ExposureSet, options: ShotOptions) -> tuple[ViewData, int | None]:
-    """Read a view of a scene, and the stored value at which it saturates.
+    """Read a view of a scene.
 
-    The saturation value is None if the scene does not state it.
+    Returns:
+        The view; and the stored value at which it saturates, or None if the scene does not state this value.
     """
     assert shot.root is not None
     layout = find_layout(shot.root)

@@ -205,9 +205,9 @@ def require_no_order(calibration: Calibration, name: str) -> None:
         require(
             not given,
             f"calibration ({field})",
-            expected="pictures at 0, 45, 90 and 135 degrees, which the option applies to",
+            expected="pictures at 0, 45, 90 and 135 degrees, to which gains and order apply",
             found=f"{name}, a set of pictures at other angles",
-            remedy="Leave it out; sense and zero apply, and angles.csv has a column gain.",
+            remedy="Remove gains and order; sense and zero apply. List gains in the column gain of angles.csv.",
         )
 
 

@@ -322,7 +322,7 @@ def read_frame_table(path: Path, video: Path) -> list[tuple[int, Angle]]:
     require(
         path.is_file(),
         path,
-        expected=f"a table frame,angle of {video.name}",
+        expected=f"a table with the columns frame,angle for {video.name}",
         found="no such file",
         remedy=_REMEDY,
     )
@@ -331,7 +331,7 @@ def read_frame_table(path: Path, video: Path) -> list[tuple[int, Angle]]:
     require(
         header == "frame,angle",
         f"{path} (line 1)",
-        expected="the header frame,angle",
+        expected='the header "frame,angle"',
         found=shortened(header) if header else "an empty file",
         remedy=_REMEDY,
     )
@@ -342,7 +342,7 @@ def read_frame_table(path: Path, video: Path) -> list[tuple[int, Angle]]:
         if angle is None or frame is None or frame in frames:
             raise PolarguideError(
                 f"{path} (line {number})",
-                expected=f"a frame that is not in another line, and its angle up to {LARGEST:g} degrees",
+                expected=f"a frame number that occurs only once, and an angle of at most {LARGEST:g} degrees",
                 found=shortened(",".join(row)),
                 remedy=_REMEDY,
             )

@@ -59,8 +59,8 @@ def measure(
             watching.watch is not None or getattr(watching, name) == getattr(WatchOptions, name),
             f"--{name}",
             expected="--watch",
-            found="one pass over files",
-            remedy="Leave it out, or watch a folder.",
+            found="no --watch",
+            remedy="Remove the option, or watch a folder.",
         )
     reading = replace(reading, calibration=angles.read(), analyzers=angles.analyzers())
     heard = partial(_print_entry, every=watching.watch is not None)
@@ -217,7 +217,7 @@ def _refuse(expected: str, found: str, **options: object) -> None:
         PolarguideError: the user specified one of the options.
     """
     for name, value in options.items():
-        remedy = f"Leave it out, or name {expected}."
+        remedy = f"Remove the option, or specify {expected}."
         require(value is None, option_name(name), expected=expected, found=found, remedy=remedy)
 
 

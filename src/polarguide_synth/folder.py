@@ -64,7 +64,7 @@ def folder_state(out: Path, request: dict[str, Any]) -> State:
         field, was, requested = first_differing_value("", before, now)
         raise PolarguideError(
             out,
-            expected="a scene that was begun with the same settings",
+            expected="a scene that was started with the same settings",
             found=f"other settings ({field[1:]}: {shortened(was)} in place of {shortened(requested)})",
             remedy=remedy,
         )
@@ -173,7 +173,7 @@ def _require(condition: bool, path: Path, expected: str) -> None:
         condition,
         path,
         expected=expected,
-        found="another" if path.is_file() else "no file",
+        found="a file with other contents" if path.is_file() else "no file",
         remedy=_REMEDY,
     )
 

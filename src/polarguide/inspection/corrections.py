@@ -85,7 +85,7 @@ def fix_scene(capture: Capture, change: Calibration, out: Path, reporter: Report
             out,
             expected="a new folder",
             found="a file" if not out.is_dir() else describe_contents(out),
-            remedy="Choose another --fix. Nothing was written.",
+            remedy="Specify another folder with --fix. Nothing was written.",
         )
     with temporary_folder(out) as partial:
         _write_corrected(capture, change, partial, reporter)
@@ -137,7 +137,7 @@ def _require_inside(root: Path, source: Path) -> None:
                 path,
                 expected="a file of the scene",
                 found=f"a link to {path.resolve()}",
-                remedy="Replace the link by a copy, or remove it. Nothing was written.",
+                remedy="Replace the link by a copy of the file, or remove the link. Nothing was written.",
             )
 
 
@@ -219,8 +219,8 @@ def corrected(capture: Capture, path: Path) -> Capture:
     if rotated:
         raise PolarguideError(
             capture.root,
-            expected="angles in steps of 45 degrees from those of the sensor",
-            found="a scene with another zero",
+            expected="a scene whose angles differ from those of its sensor by multiples of 45 degrees",
+            found="a scene with another zero of its angles",
             remedy=_REMEDY,
         )
     cache: dict[bytes, NDArray[np.float32]] = {}

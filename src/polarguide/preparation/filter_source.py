@@ -140,14 +140,14 @@ class ShotsSource(Source):
                 "--white-balance",
                 expected="none for pictures; none or three gains for camera raw",
                 found=settings.white_balance,
-                remedy="Omit it.",
+                remedy="Remove the option.",
             )
         if raw and settings.transfer == "srgb":
             raise PolarguideError(
                 "--transfer",
                 expected="auto or linear for camera raw, which is developed without tone curve",
                 found="srgb",
-                remedy="Omit it.",
+                remedy="Remove the option.",
             )
         self._white = white
         self._as_stored: frozenset[str] = frozenset()

@@ -150,9 +150,9 @@ def _consecutive(
         if len(stated) not in (1, each):
             raise PolarguideError(
                 "--angles",
-                expected=f"{each} angles, because groups of {each} consecutive pictures show one place",
+                expected=f"{each} angles, because every {each} consecutive pictures show one place",
                 found=angles,
-                remedy="Correct them, or use --shots-per-view 1 if every picture is a view of its own.",
+                remedy="Correct the angles, or use --shots-per-view 1 if every picture is a view of its own.",
             )
         notes = (
             f"Groups of {each} consecutive pictures show one place. Each is one view, named like its first picture "
@@ -209,9 +209,9 @@ def _require_photographs(root: Path) -> None:
         raise PolarguideError(
             root,
             expected="the angles of shots through a filter",
-            found=f"{len(files)} pictures, of which groups of {each} consecutive ones show one place",
-            remedy=f"Specify the angles in their order, such as --angles {angles} --shots-per-view {each}. Ordinary "
-            "photographs without a filter: --angles none.",
+            found=f"{len(files)} pictures without angles, of which every {each} consecutive pictures show one place",
+            remedy=f"Specify the angles in the order of the pictures, such as --angles {angles} --shots-per-view "
+            f"{each}. For ordinary photographs without a filter, use --angles none.",
         )
 
 

@@ -151,8 +151,8 @@ class PrepareSettings(RawOptions, MosaicSettings, SinglesSettings):
         if self.shots_per_view is not None and self.angles is None:
             raise PolarguideError(
                 "--shots-per-view",
-                expected="--angles with the angles of the shots of a view in their order, or a word",
-                found="none",
+                expected="the angles of the shots of each view in --angles, or --angles unknown or none",
+                found="no --angles",
                 remedy="Specify both, such as --angles 0,45,90,135 --shots-per-view 4.",
             )
         if self.intrinsics is not None:
@@ -162,7 +162,7 @@ class PrepareSettings(RawOptions, MosaicSettings, SinglesSettings):
                 "--refine-intrinsics",
                 expected="initial values in --intrinsics",
                 found="no --intrinsics",
-                remedy="Omit it: unknown intrinsics are always estimated.",
+                remedy="Remove the option: unknown intrinsics are always estimated.",
             )
         return replace(
             self,
@@ -243,13 +243,13 @@ def settings_of_format(settings: PrepareSettings, kind: str) -> GainOptions:
             option_name(name),
             expected=f"only options of the format {kind}",
             found=f"an option of {', '.join(others)} and {last}" if others else f"an option of {last}",
-            remedy="Omit it, or choose another --format.",
+            remedy="Remove the option, or choose another --format.",
         )
     calibration = settings.calibration
     if kind == "singles" and (calibration.gains is not None or calibration.order != ANGLES):
         raise PolarguideError(
             "calibration (gains, order)",
-            expected="only sense and zero for single shots",
+            expected="only sense and zero in the calibration of single shots",
             found=f"gains {calibration.gains}, order {calibration.order}",
             remedy="List the angle and gain of every shot in angles.csv.",
         )

@@ -438,7 +438,7 @@ class MosaicSource(Source):
                 "--white-balance",
                 expected="none for a monochrome sensor",
                 found=settings.white_balance,
-                remedy="Omit it.",
+                remedy="Remove the option.",
             )
 
     def stored(self, view: str) -> Stored:

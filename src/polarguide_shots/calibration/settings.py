@@ -78,7 +78,7 @@ class CalibrateSettings(MosaicOptions):
             "--lens",
             expected="one line of text",
             found=repr(self.lens),
-            remedy="Leave control characters out.",
+            remedy="Remove control characters.",
         )
         period = sensor_pattern(self.sensor).period
         require(
@@ -91,9 +91,9 @@ class CalibrateSettings(MosaicOptions):
         require(
             self.reference != "angles" or self.angles is not None,
             "--reference",
-            expected="mean for unknown angles of the polarizer",
+            expected="mean, because the angles of the polarizer are unknown",
             found="angles",
-            remedy="Give the --angles, or leave it out.",
+            remedy="Specify --angles, or remove --reference.",
         )
         return self
 
@@ -129,7 +129,7 @@ class CalibrateSettings(MosaicOptions):
                 "--angles",
                 expected=f"an angle for each of the {len(files)} shots",
                 found=f"{len(degrees)} angles",
-                remedy="List them in the order of the files' names; keep dark frame and flat field elsewhere.",
+                remedy="List the angles in the order of the files' names. Keep dark frame and flat field elsewhere.",
             )
         sign = -1.0 if self.sense == "cw" else 1.0
         return [sign * math.radians(angle) for angle in degrees]

@@ -288,7 +288,7 @@ def _files(option: str, path: Path | None) -> list[Path]:
         f"{option} {path}",
         expected="a mosaic, or a folder of mosaics",
         found=describe_contents(path),
-        remedy="Leave it out, or give the files.",
+        remedy="Remove the option, or specify the files.",
     )
     return paths
 
@@ -373,7 +373,7 @@ def solve_shots(
             path,
             expected=f"light through a polarizer, with a DoLP above {POLARIZED:.0%}",
             found=f"{_dolp(stokes):.0%}",
-            remedy="Take it through the polarizer, and the --flat without it. Check --sensor and offsets.",
+            remedy="Take the shot through the polarizer, and --flat without the polarizer. Check --sensor and offsets.",
         )
     if flat is not None:
         dolp = _dolp(_pixel_stokes(flat[None], nominal)[0])
@@ -382,7 +382,7 @@ def solve_shots(
             "--flat",
             expected="unpolarized light",
             found=f"a DoLP of {dolp:.0%}",
-            remedy="Take it without the polarizer, of a light behind a thick diffuser; no screen, no reflection.",
+            remedy="Take --flat without the polarizer, of a lamp behind a thick diffuser. Avoid screens and reflections.",
         )
     apparent = np.arctan2(start[:, 2], start[:, 1]) / 2
     if known is not None:
@@ -431,9 +431,9 @@ def _require_steady(brightness: Array, folder: Path) -> None:
     require(
         change <= UNSTEADY,
         folder,
-        expected=f"one steady, unpolarized light, whose shots differ by at most {UNSTEADY:.0%} in brightness",
+        expected=f"one steady, unpolarized light: shots that differ in brightness by at most {UNSTEADY:.0%}",
         found=f"{change:.0%}: the lamp is polarized, or lamp or exposure changed",
-        remedy="Give --angles, or --flat (a picture without the polarizer), which measure the light of each shot.",
+        remedy="Specify --angles, or --flat (a picture without the polarizer), to measure the light of each shot.",
     )
 
 

@@ -294,7 +294,7 @@ class Line(contextlib.AbstractContextManager["Line"]):
                 shot.where,
                 expected="a file that does not change while it is read",
                 found="a file that was written to",
-                remedy="Repeat the command when it is complete; --watch waits for that.",
+                remedy="Repeat the command when the file is complete, or use --watch, which waits for complete files.",
             )
         measured = self.measurer.measured(shot, maps)
         # A line in the table implies that its pictures exist.
@@ -434,7 +434,7 @@ def _shots_of(
     reading: ShotOptions,
     angles: Sequence[Angle],
 ) -> tuple[Iterable[ExposureSet], int | None]:
-    """Return the shots to measure, and their number. The number is None for an iterator.
+    """Return the shots to measure, and their number. An iterator has no number, which gives None.
 
     Raises:
         PolarguideError: there is no shot, or an array is not a shot.
@@ -447,7 +447,7 @@ def _shots_of(
         "paths",
         expected="several shots",
         found="one array",
-        remedy="Put it into a list: measure([array]).",
+        remedy="Put the array into a list: measure([array]).",
     )
     if not isinstance(paths, Sequence):
         return (_array_set(shot, number, reading, angles) for number, shot in enumerate(paths, 1)), None
@@ -481,6 +481,6 @@ def _array_set(shot: Source, number: int, reading: ShotOptions, angles: Sequence
             name,
             expected="an array",
             found=type(shot).__name__,
-            remedy="An iterator delivers arrays; give paths as a list.",
+            remedy="An iterator must yield arrays. Specify paths as a list.",
         )
     return array_shot(stacked_array(shot, name), reading, angles, name)

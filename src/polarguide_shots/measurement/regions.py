@@ -194,8 +194,8 @@ def region_figures(maps: ShotMaps, region: Region, threshold: float) -> dict[str
         threshold: DoLP above which pixels count in ``dolp_share``.
 
     Returns:
-        Values by ``Field.key``, from ``pixels`` to ``aolp_concentration``, with angles in degrees. A value is None if
-        it would be computed from no pixel.
+        Values by ``Field.key``, from ``pixels`` to ``aolp_concentration``, with angles in degrees. Values that cannot
+        be computed, because no pixel is usable, become None.
     """
     at = region.place
     reason = maps.reason[at]
@@ -301,7 +301,7 @@ def subtract(maps: ShotMaps, golden: ShotMaps) -> Differences:
         maps.files[0] if maps.files else maps.name,
         expected=f"{golden.size[0]}x{golden.size[1]} pixels like the reference {golden.name}",
         found=f"{maps.size[0]}x{maps.size[1]}",
-        remedy="Take both with one camera and one region, and develop them alike.",
+        remedy="Take both shots with the same camera and region, and develop them with the same options.",
     )
     reason = np.maximum(maps.reason, golden.reason)
     angle = np.remainder(maps.aolp - golden.aolp + math.pi / 2, math.pi) - math.pi / 2
@@ -334,7 +334,7 @@ def read_reference(path: Path, options: ShotOptions) -> ShotMaps:
         "--reference",
         expected="one shot",
         found=f"{len(shots)} in {path}",
-        remedy="Name a file of the shot.",
+        remedy="Specify one file of the shot.",
     )
     maps = read_shot(shots[0], options)
     return replace(maps, intensities=maps.intensities[:, :0].copy())
@@ -343,7 +343,7 @@ def read_reference(path: Path, options: ShotOptions) -> ShotMaps:
 def difference_figures(differences: Differences | None, region: Region) -> dict[str, Value]:
     """Return statistics of the differences in a region by ``Field.key``. The first key is ``compared``.
 
-    All values are None if there is no reference.
+    Without a reference, each value equals None.
     """
     figures: dict[str, Value] = dict.fromkeys(COMPARED)
     if differences is None:

@@ -452,7 +452,7 @@ class Table(contextlib.AbstractContextManager["Table"]):
                     f"{path} ({name[1:]})",
                     expected=shortened(was, 200),
                     found=shortened(requested, 200),
-                    remedy=f"One table has one set of options. {_REPLACE}",
+                    remedy=f"All shots of a table need the same options. {_REPLACE}",
                 )
         elif not overwrite:
             require(
