@@ -61,7 +61,11 @@ def find_shots(
     """
     options = options or ShotOptions()
     require(
-        paths, "paths", expected="at least one file or folder of shots", found="none", remedy="Specify some paths."
+        paths,
+        "paths",
+        expected="at least one file or folder of shots",
+        found="none",
+        remedy="Specify some paths.",
     )
     shots = list_shots(paths, options)
     faults = [shot.fault for shot in shots if shot.empty and shot.fault is not None]

@@ -209,7 +209,7 @@ def _require_photographs(root: Path) -> None:
         raise PolarguideError(
             root,
             expected="the angles of shots through a filter",
-            found=f"{len(files)} pictures without angles, of which every {each} consecutive pictures show one place",
+            found=f"{len(files)} pictures without angles, in which groups of {each} show one place each",
             remedy=f"Specify the angles in the order of the pictures, such as --angles {angles} --shots-per-view "
             f"{each}. For ordinary photographs without a filter, use --angles none.",
         )

@@ -382,7 +382,7 @@ def solve_shots(
             "--flat",
             expected="unpolarized light",
             found=f"a DoLP of {dolp:.0%}",
-            remedy="Take --flat without the polarizer, of a lamp behind a thick diffuser. Avoid screens and reflections.",
+            remedy="Take --flat without the polarizer, with a thick diffuser. Avoid screens and reflections.",
         )
     apparent = np.arctan2(start[:, 2], start[:, 1]) / 2
     if known is not None:
