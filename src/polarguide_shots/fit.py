@@ -125,7 +125,7 @@ class SetModel:
         gains = samples.gains[:, None]
         self._floor = np.float32(noise.floor * share) / gains**2
         self._slope = np.float32(noise.slope * share) / gains
-        self._limit = 2 * float(erfcinv(FALSE_ALARMS / len(used))) ** 2  # squared, two-sided
+        self._limit = 2 * float(erfcinv(FALSE_ALARMS / len(used))) ** 2  # limit of a squared residual, for a two-sided test
 
     def variances(self, stokes: Array) -> Array:
         """Predict the variances [K, N] of the samples from Stokes vectors [3, N]."""
@@ -140,7 +140,7 @@ class SetModel:
         """
         usable = (~lost & self._used[:, None]).astype(np.float32)
         determined = self._determined(usable)
-        usable[:, ~determined] = 1  # pictures show a fit at these pixels as well
+        usable[:, ~determined] = 1  # such pixels also get a value, for the pictures of the maps
         stokes, _ = self._solve(usable, gray)
         weights = usable / self.variances(stokes)
         fit = SetFit(*self._solve(weights, gray), weights, determined)
@@ -152,7 +152,7 @@ class SetModel:
         doubled = self._squares * np.array([[1], [2], [2], [1], [2], [1]], np.float32)
         at = np.flatnonzero(fit.determined)
         while at.size:
-            # Four samples have equal residuals, which do not identify an outlier.
+            # With four samples, all residuals are equal and do not identify an outlier.
             at = at[(fit.weights[:, at] > 0).sum(axis=0) >= 5]
             weights = fit.weights[:, at]
             leverage = weights * (doubled.T @ fit.covariance[:, at])
@@ -262,7 +262,7 @@ def maps_of_set(name: str, files: tuple[Path, ...], samples: SetSamples, options
 
 
 _FLOAT_MAPS = ("dolp", "dolp_debiased", "aolp", "sigma_dolp", "sigma_aolp", "residual")
-"""Names of the maps [H, W] of 32-bit floats."""
+"""Names of the maps that are stored as 32-bit floats."""
 
 
 def _fill(maps: dict[str, Any], part: slice, samples: SetSamples, model: SetModel, snr: float) -> None:

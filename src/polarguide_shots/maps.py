@@ -123,7 +123,7 @@ class ShotMaps:
 
     @property
     def s0(self) -> Map:
-        """S0 of the luminance, [H, W]; a photograph shows half of it."""
+        """S0 of the luminance, [H, W]. A photograph without a polarizer shows half of it."""
         return np.asarray(self.stokes[0])
 
     @property

@@ -290,7 +290,7 @@ class SurfaceMaps:
 
 
 def parse_intrinsics(text: str, size: tuple[int, int]) -> Camera:
-    """Parse ``fx,fy,cx,cy`` in pixels of a picture of ``size`` (width, height).
+    """Parse the intrinsics ``fx,fy,cx,cy``, in pixels of a picture of ``size`` (width, height).
 
     Raises:
         PolarguideError: the text is invalid.
@@ -466,7 +466,7 @@ def is_array(shot: object) -> TypeGuard[Array | Sequence[Array]]:
 
 
 def stacked_array(shot: Array | Sequence[Array], name: str = NAME) -> Array:
-    """Stack a list of pictures to one array; return an array unchanged.
+    """Stack a list of pictures to one array. An array is returned unchanged.
 
     Raises:
         PolarguideError: the pictures of the list differ in shape or type.
@@ -620,7 +620,7 @@ def _cut(part: Part | None, shape: tuple[int, ...], step: int) -> tuple[slice, s
 
 
 _MAPS = 4 * (4 * 3 + 3 + 5)
-"""Bytes per pixel of the intensities and the first maps."""
+"""Bytes per pixel that the intensities and the first maps need. They decide if a shot fits into memory."""
 
 
 def develop(shot: ExposureSet, options: ShotOptions, part: Part | None = None) -> Developed:

@@ -114,7 +114,7 @@ class ExposureSet:
 
     @property
     def complete(self) -> bool:
-        """True if a table lists the pictures of a set, or they cover half a turn evenly."""
+        """True if all pictures of a set have arrived: a table lists them, or their angles cover half a turn evenly."""
         angles = [picture.angle for picture in self.pictures if not isinstance(picture.angle, str)]
         return self.table is not None or covers_turn([angle % 180 for angle in angles])
 

@@ -424,7 +424,7 @@ def _user_mesh(path: Path) -> Mesh:
         found=f"a name that ends in {path.suffix or 'nothing'}" if path.is_file() else "nothing",
         remedy="File names of meshes are relative to the folder of the scene file.",
     )
-    # Without normals first: Mitsuba computes normals before it validates corners, and writes out of bounds.
+    # Read without normals first, because Mitsuba would compute normals before it validates the indices of corners.
     params = _mesh_arrays(path, kind, flat=True)
     points = np.array(params["vertex_positions"], float).reshape(-1, 3)
     faces = np.array(params["faces"], np.int64).reshape(-1, 3)
@@ -472,7 +472,7 @@ def _mesh_arrays(path: Path, kind: str, *, flat: bool) -> Any:
 
 
 def _texture(thing: Thing, mesh: Mesh, folder: Path) -> Array | None:
-    """Return the texture of an object, [H, W, 3], or None for an object of one color.
+    """Return the texture [H, W, 3] of an object. Return None for an object of one color.
 
     Raises:
         PolarguideError: the texture is invalid, or the mesh has no colors for the color "own".

@@ -274,7 +274,7 @@ def _sampled(parts: list[dict[str, Any]], blend: float, low: Array, high: Array,
 
 
 def _mirrored(part: dict[str, Any]) -> dict[str, Any]:
-    """Return the data of the mirrored copy of a part."""
+    """Return the data of a part that is mirrored as its field ``mirror`` requests."""
     axis = "xy".index(part["mirror"])
     copy = dict(part)
     for name in {"at", "from", "to", "rotation"} & set(part):

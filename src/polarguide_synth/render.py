@@ -80,7 +80,7 @@ class Plan:
 
     @cached_property
     def tests(self) -> list[str]:
-        """Names of the held-out views; empty for a single view."""
+        """Names of the held-out views. Empty if there is only one view."""
         return self.names[:: self.settings.test_every] if len(self.names) > 1 else []
 
     def unfinished(self) -> list[int]:
@@ -98,7 +98,7 @@ class Plan:
 
     @property
     def mosaics(self) -> bool:
-        """True if raw mosaics are written."""
+        """True if the rendering also writes raw mosaics."""
         return self.settings.sensor in SENSORS
 
     def photograph(self, number: int) -> tuple[FilterShot, Path] | None:
@@ -113,7 +113,7 @@ class Plan:
         return self.settings.ground_truth == "all" or name in self.tests
 
     def files(self, name: str) -> list[Path]:
-        """Return the files of a view."""
+        """Return the paths of all files of a view."""
         files = folder.view_files(self.out, name, ground_truth=self.has_ground_truth(name), raw=self.mosaics)
         photograph = self.photograph(self.names.index(name))
         return files if photograph is None else [*files, photograph[1]]
@@ -267,7 +267,7 @@ def render_view(job: Job, number: int) -> None:
                 stokes, camera.rays(dtype=torch.float64).numpy(), shot, settings.noise, random, job.sensor
             ),
         )
-    # The files of a simulated sensor have the noise. These pictures are their noise-free reference.
+    # Only the files of a simulated sensor contain noise. These pictures are their noise-free reference.
     noise = settings.noise if settings.sensor == "ideal" else 0.0
     write_view(
         job.out, name, folder.sensor_codes(stokes, lambda values: noisy(values, noise, random, job.sensor))

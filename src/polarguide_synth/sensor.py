@@ -315,7 +315,7 @@ def _sums(
     limits: PathLimits,
     center: bool,
 ) -> list[Any]:
-    """Sum ``count`` samples of each pixel in one batch."""
+    """Trace ``count`` samples of each pixel in one batch, and return their sums."""
     first, per_pixel = part
     index = dr.arange(mi.UInt32, pixels * count)
     pixel = index // per_pixel
@@ -351,6 +351,6 @@ def _path(
 
 
 def _shifted(sample: Any) -> Any:
-    """Return four equally spaced numbers modulo 1, one for each wavelength of a ray."""
+    """Return four equally spaced numbers modulo 1, from which the wavelengths of a ray are sampled."""
     values = (sample + k / 4 for k in range(4))
     return mi.UnpolarizedSpectrum(*(dr.select(value >= 1.0, value - 1.0, value) for value in values))

@@ -243,7 +243,7 @@ def _continue_paths(
              delta: Any, random: Any) -> Any:  # fmt: skip
         si = scene.ray_intersect(ray, active)
         rival = 0.0
-        if si.emitter(scene) is not None:  # always, except in the scalar variant
+        if si.emitter(scene) is not None:  # None only in the scalar variant
             sample = mi.DirectionSample3f(scene, si, place)
             rival = scene.pdf_emitter_direction(place, sample, active & (delta ^ True))
         share = dr.select(delta, 1.0, pdf / dr.maximum(pdf + rival, TINY))
@@ -332,7 +332,7 @@ def _emitted(scene: Any, si: Any, active: Any) -> Any:
 
 def _visible(si: Any) -> Any:
     """Return True if the camera sees the surface at an intersection. Return False for lights and the environment."""
-    if si.shape is None:  # the scalar variant
+    if si.shape is None:  # occurs only in the scalar variant
         return False
     return si.shape.eval_attribute_1(VISIBLE, si, mi.Bool(si.is_valid())) > 0.5
 

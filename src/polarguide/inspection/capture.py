@@ -213,7 +213,7 @@ def _inspected_view(item: ViewData, camera: Camera | None, full_scale: int | Non
 MEASURABLE = 1.0 / 256.0
 """Smallest mean intensity of a pixel whose polarization can be measured. It is one step of an 8-bit value."""
 POLARIZED = 0.05
-"""Smallest DoLP of a polarized pixel."""
+"""Smallest DoLP of a pixel that counts as polarized."""
 OF_FOUR = ("noise", "noise_share", "pair_ratio", "sum_error", "dolp", "polarized", "above_limit")
 """Names of the measurements that need pictures at four angles."""
 _QUANTILE_SAMPLES = 200_000
@@ -265,7 +265,7 @@ class ViewMeasurements:
 
 
 def measure_view(view: InspectedView, index: float) -> ViewMeasurements:
-    """Measure one view.
+    """Measure the brightness, noise and polarization of one view.
 
     Args:
         view: the view.

@@ -280,7 +280,7 @@ class Inspection:
 
     @property
     def verdict(self) -> Verdict:
-        """The worst verdict of all checks."""
+        """Worst verdict of all checks."""
         return worst(self.checks)
 
     def check(self, key: str) -> Check:

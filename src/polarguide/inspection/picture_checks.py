@@ -78,7 +78,7 @@ def find_pairing(capture: Capture) -> int | None:
     gains = measured_exposures(capture) if residuals.any() else None
     limit = PictureLimits.exposed_unequal / AngleLimits.sure
     if gains is not None and gains.pairing is not None and max(gains.errors) < limit:
-        return gains.pairing  # for any exposures
+        return gains.pairing  # also valid for unequal exposures
     return decide_pairing(residuals)
 
 

@@ -163,7 +163,7 @@ def estimate_shot_angles(
     recipe = training_recipe(RECIPE)
     blind = without_angles(scene)
     total = math.ceil(steps / recipe.angle_rules.last)
-    until = Polarizers(blind, recipe, total).search + 1  # fits precede a step
+    until = Polarizers(blind, recipe, total).search + 1  # the fit is done before the step
     state = short_run(
         blind,
         folder,

@@ -168,7 +168,7 @@ class ShotsSource(Source):
         self._as_stored = frozenset(views)
 
     def used_as_stored(self, view: str) -> bool:
-        """Return True if a view is not rotated, regardless of its orientation tag."""
+        """Return True if a view is developed without rotation, regardless of its orientation tag."""
         return view in self._as_stored
 
     def _require_memory(self, what: str) -> None:
@@ -519,7 +519,7 @@ def reconciled(
     return Exposures(logs, tuple(int(k) for k in np.flatnonzero(odd)), scatter)
 
 
-# Logarithm of a gain that differs from the others by one and a half stops. It gets a warning if files do not state it.
+# Smallest unusual deviation of a gain's logarithm (1.5 stops). A warning follows unless a file states this gain.
 _FAR = math.log(2.0) * 1.5
 _LISTED = 12
 
@@ -606,7 +606,7 @@ def _estimate(root: Path, pictures: list[PictureRow], posed: bool, reporter: Rep
         numbers = compared.points
         errors = compared.errors
     of_view = np.array([float(np.mean((files - within)[rows[view]])) for view in views])
-    # Views with and without a filter: most of their light passed the filter.
+    # A view that has shots with and without a filter counts as a view with a filter.
     bare = np.array([all(pictures[k].record.angle == "none" for k in rows[view]) for view in views])
     estimate = reconciled(points, of_view, bare, errors)
     finite = np.isfinite(estimate.logs)
@@ -629,7 +629,7 @@ def _within_views(pictures: list[PictureRow], files: NDArray[np.float64]) -> NDA
     for view in {picture.view for picture in pictures}:
         places = [k for k, picture in enumerate(pictures) if picture.view == view]
         bare = np.array([pictures[k].record.angle == "none" for k in places])
-        # Compared with a shot through the filter, a shot without it gets twice the light at the same exposure.
+        # At the same exposure, a shot without the filter gets twice the light of a shot through the filter.
         extra = np.where(bare & (not bare.all()), math.log(2.0), 0.0)
         logs = files[places] + extra if np.isfinite(files[places]).all() else extra
         relative[places] = logs - logs.mean()

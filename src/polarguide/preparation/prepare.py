@@ -142,10 +142,10 @@ class SceneFolder:
                 _require_exposures(path, view, record)
         settings = {**_EARLIER_SETTINGS, **before.request.settings}
         now = dict(request.settings)
-        if settings.get("white_balance") == "grey":  # its name in earlier journals
+        if settings.get("white_balance") == "grey":  # spelling in journals of earlier versions
             settings["white_balance"] = "gray"
         if settings.get("matching") == "exhaustive" and now["matching"] == "auto":
-            now["matching"] = "exhaustive"  # the default of earlier journals
+            now["matching"] = "exhaustive"  # default of earlier versions
         follows_none = settings.get("poses") == "none" != now["poses"]
         if follows_none:
             settings |= {name: now[name] for name in _POSE_SETTINGS}
@@ -166,7 +166,7 @@ class SceneFolder:
 
     @property
     def views(self) -> dict[str, ViewRecord]:
-        """Records of the written views."""
+        """Records of the views that have been written, by name."""
         return self.state.views
 
     @property
@@ -635,7 +635,7 @@ def _turns(folder: SceneFolder) -> str:
     counts = sorted(Counter(int(record.orientation or 1) for record in records).items())
     turned = listed([f"{count} {TURNS[code]}" for code, count in counts])
     noted = [shot.angle for record in records for shot in record.exposures or ()]
-    # Shots of a view at the usual four angles have no list of exposures.
+    # The list is empty if all views have shots at the usual four angles.
     angles = not noted or any(not isinstance(angle, str) for angle in noted)
     also = ", including their polarizer angles" if angles else ""
     return f"EXIF orientation: {len(records)} of {len(folder.views)} views were rotated for display{also} ({turned})."

@@ -89,7 +89,7 @@ class Stored:
 
     @property
     def sizes(self) -> tuple[tuple[int, int], ...]:
-        """Possible sizes of the camera of a view: stored, rotated and developed."""
+        """Sizes that the camera of a view may have: stored, rotated and developed."""
         if self.size is None:
             return ()
         turned = (self.size[::-1],) if self.orientation in QUARTER_TURNS else ()
@@ -136,7 +136,7 @@ class Source(Protocol):
         return None
 
     def used_as_stored(self, view: str) -> bool:
-        """Return True if ``use_stored`` contains a view."""
+        """Return True if a view is developed as stored, because ``use_stored`` selected it."""
         return False
 
 
@@ -442,7 +442,7 @@ class MosaicSource(Source):
             )
 
     def stored(self, view: str) -> Stored:
-        """Return the size from the header of the mosaic, or from the settings."""
+        """Return the size of a view, from the header of its mosaic or from the settings."""
         settings = self._settings
         size = stated_size(self._files[view])
         if size is None and settings.width is not None and settings.height is not None:

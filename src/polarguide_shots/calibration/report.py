@@ -88,7 +88,7 @@ def _polarized_light(angles: Array) -> Array:
 
 
 def lines(calibration: AnalyzerCalibration, analyzers: list[Position]) -> list[str]:
-    """Return the lines of the table for the console."""
+    """Return the lines of the table that is printed on the console."""
     rows = ["position   throughput             extinction ratio       angle error in degrees"]
     for position in analyzers:
         cells = []

@@ -335,7 +335,7 @@ class ShotFit:
     flat_dolp: float | None
 
     def stokes(self, diattenuation: float) -> Array:
-        """Return the Stokes vectors of the light in the shots, [T, 3]."""
+        """Return the Stokes vectors [T, 3] of the light in the shots, behind a polarizer with this diattenuation."""
         return _stokes(self.angles, self.levels, diattenuation)
 
 
@@ -438,7 +438,7 @@ def _require_steady(brightness: Array, folder: Path) -> None:
 
 
 def _stokes(angles: Array, levels: Array, diattenuation: float) -> Array:
-    """Return Stokes vectors behind a polarizer, [T, 3]."""
+    """Return the Stokes vectors [T, 3] of light behind a polarizer, given its angles and the levels of the light."""
     polarized = diattenuation * np.cos(2 * angles), diattenuation * np.sin(2 * angles)
     return levels[:, None] * np.stack([np.ones_like(angles), *polarized], axis=1)
 
@@ -574,7 +574,7 @@ def _mean_deviation(vectors: Array, nominal: Array) -> float:
 
 
 def _turned(vectors: Array, angle: float) -> Array:
-    """Rotate analyzer vectors [K, 3] by an angle in radians."""
+    """Rotate analyzer vectors [K, 3] about the optical axis, by an angle in radians."""
     cosine = np.cos(2 * angle)
     sine = np.sin(2 * angle)
     s0, s1, s2 = vectors.T

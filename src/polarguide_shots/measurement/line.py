@@ -415,7 +415,7 @@ def _measure_into(line: Line, shot: ExposureSet, heard: Heard) -> tuple[bool, En
     known = line.table.entry_of(files) if files else None
     if known is not None:
         if line.table.judged_again:
-            with contextlib.suppress(*UNREADABLE):  # the line is more important than the picture
+            with contextlib.suppress(*UNREADABLE):  # a missing picture must not prevent the line
                 line.follow_judgment(shot, known)
             if known.status == "beyond":
                 heard(known)

@@ -230,7 +230,10 @@ def _difference_panels(differences: Differences) -> dict[str, tuple[Map, float, 
 
 
 def diverging(values: Map, most: float) -> Picture:
-    """Convert numbers to colors: blue at ``-most``, light at 0, red at ``most``, gray for NaN; uint8 RGB [H, W, 3]."""
+    """Convert numbers to colors, uint8 RGB [H, W, 3].
+
+    Colors are blue at ``-most``, light at 0, red at ``most``, and gray for NaN.
+    """
     finite = np.isfinite(values)
     place = np.clip(np.where(finite, values, 0) / most, -1, 1)[..., None]
     fall = np.where(place > 0, np.array([62, 216, 197], np.float32), np.array([207, 138, 68], np.float32))

@@ -169,7 +169,7 @@ def placed(regions: Sequence[Region], size: tuple[int, int], where: Path | str) 
 
 
 def box_of(regions: Sequence[Region]) -> Part | None:
-    """Return the smallest rectangle around regions, or None without regions."""
+    """Return the smallest rectangle that contains all regions, or None if there are no regions."""
     if not regions:
         return None
     left, top = np.min([(r.x, r.y) for r in regions], axis=0).tolist()

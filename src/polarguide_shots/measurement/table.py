@@ -123,7 +123,7 @@ FIELDS = (
 )
 """Fields in the order of the columns. A missing value is an empty cell in CSV, and null in JSON."""
 KEYS = tuple(field.key for field in FIELDS)
-"""Names of the fields."""
+"""Names of the fields of the table, in the order of the columns."""
 BOUNDED = tuple(field.key for field in FIELDS if field.bounded)
 """Names of the fields for which a limits file may contain a limit."""
 COMPARED = KEYS[KEYS.index("compared") :]
@@ -154,7 +154,7 @@ class Limits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     regions: dict[str, dict[str, Bound]] = {}
 
     def of(self, region: str) -> dict[str, Bound]:
-        """Return the bounds of a region, by field."""
+        """Return the bounds that apply to a region, by field."""
         return {**self.limits, **self.regions.get(region, {})}
 
 
@@ -187,7 +187,7 @@ def read_limits(path: Path, regions: Collection[str], *, reference: bool) -> Lim
 
 
 def _check(where: str, field: str, bound: Bound, reference: bool) -> None:
-    """Validate the bound of a field.
+    """Check that a limits file may contain a bound for a field, and that the bound is valid.
 
     Raises:
         PolarguideError: the field is unknown or needs a reference, or the bound is invalid.
