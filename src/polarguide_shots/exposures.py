@@ -31,8 +31,8 @@ from polarguide_shots.sets import ExposureSet, known_indices
 _EXPECTED = "raw mosaics with --sensor, or shots with angles in their names"
 _REMEDY = (
     f"Raw mosaics need --sensor: {SENSOR_NAMES}; shots need their angles in the names "
-    "(<shot>_0, _45, _90 and _135; at other angles <shot>_a10, _a40, ...), folders 0, 45, 90 and 135, or angles.csv with the "
-    "columns file,angle."
+    "(<shot>_0, _45, _90 and _135; at other angles <shot>_a10, _a40, ...), folders 0, 45, 90 and 135, or angles.csv "
+    "with the columns file,angle."
 )
 
 

@@ -125,7 +125,7 @@ class SetModel:
         gains = samples.gains[:, None]
         self._floor = np.float32(noise.floor * share) / gains**2
         self._slope = np.float32(noise.slope * share) / gains
-        self._limit = 2 * float(erfcinv(FALSE_ALARMS / len(used))) ** 2  # limit of a squared residual, for a two-sided test
+        self._limit = 2 * float(erfcinv(FALSE_ALARMS / len(used))) ** 2  # squared limit, two-sided test
 
     def variances(self, stokes: Array) -> Array:
         """Predict the variances [K, N] of the samples from Stokes vectors [3, N]."""
