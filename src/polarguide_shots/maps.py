@@ -244,9 +244,9 @@ def interpolation_factors(sensor: str, x: int, y: int, mode: str) -> tuple[NDArr
         mode: mode of demosaicing.
 
     Returns:
-        Factors [4, p, p] over a period p of the pattern, which are the variance of an intensity divided by that of a
-        sample; and the variance of the mean of many intensities, multiplied by their number. The latter exceeds the
-        mean of the factors because neighboring pixels share samples.
+        Two results. The first contains factors [4, p, p] over a period p of the pattern. A factor is the variance of an
+        intensity, divided by the variance of a sample. The second is the variance of the mean of many intensities,
+        multiplied by their number. It exceeds the mean of the factors because neighboring pixels share samples.
     """
     pattern = sensor_pattern(sensor).shifted(x, y)
     side = 4 * _REACH

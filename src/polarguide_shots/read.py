@@ -377,8 +377,8 @@ def _nearest_normal(
 ) -> tuple[Tensor, Tensor]:
     """Return the zeniths [3, ...] of the candidates of the normal, and the candidate nearest to ``TOWARD``.
 
-    The result equals that of ``optics.disambiguate``, but only three of the six candidates are computed: the candidates
-    form pairs that are half a turn apart, and the nearer candidate of a pair is on the side of the prior.
+    The result equals that of ``optics.disambiguate``, but only three of the six candidates are computed. The candidates
+    form pairs that are half a turn apart. The nearer candidate of a pair is on the side of the prior.
     """
     below, above = optics.specular_zeniths(dolp, index)
     zeniths = torch.stack((optics.diffuse_zenith(dolp, index), below, above))

@@ -151,7 +151,7 @@ def require_determined(where: object, angles: Sequence[Angle]) -> None:
 
 
 def known_indices(view: str, exposures: Sequence[Exposure]) -> list[int]:
-    """Return the indices of the pictures of a view that have known angles.
+    """Return the indices of the pictures of a view whose angles are known.
 
     Raises:
         PolarguideError: the angles do not determine Stokes vectors.

@@ -144,8 +144,7 @@ def develop_view(pictures: Source, view: str, measured: Measured) -> DevelopedVi
     """Develop a view with ``Source.develop``, and add its mask.
 
     Raises:
-        PolarguideError: the mask cannot be read, or its size is neither that of the stored nor of the developed
-            picture.
+        PolarguideError: the mask cannot be read. Or its size differs from both the stored and the developed picture.
     """
     done = pictures.develop(view, measured)
     if view not in pictures.masks:

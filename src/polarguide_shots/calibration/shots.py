@@ -307,7 +307,7 @@ POLARIZED = 0.5
 FLAT_POLARIZED = 0.1
 """Smallest DoLP of a flat field that is certainly polarized. Unequal gains of a sensor cause less."""
 UNSTEADY = 0.15
-"""Largest change of the brightness that errors of a sensor can cause (3 % of gain, extinction ratios of 20)."""
+"""Largest change of the brightness that sensor errors can cause (3 % of gain, extinction ratios of 20)."""
 LARGEST_ZERO = np.radians(10.0)
 """Largest error of the zero direction of angles that the user specified, radians."""
 ALIKE = 0.9
