@@ -1,4 +1,4 @@
-"""The Python interface of shots and cameras: priors, measurements and calibration."""
+"""Python interface for single shots and cameras: polarization maps, measurements and calibration."""
 
 from __future__ import annotations
 
@@ -44,16 +44,18 @@ def priors(
 ) -> Path:
     """Write polarization priors of views of a scene: pictures, a contact sheet, and maps in the requested formats.
 
-    The priors use the masks, exposures and size of the views. ``shot_priors`` does the same for files of a camera.
+    The priors use the masks, exposures and size of the views. For files of a camera, use ``shot_priors`` instead.
 
     Args:
         scene: a scene with poses, or its folder.
         out: folder to write.
-        run, views, threshold: see ``results.rendering.pictures.write_priors``.
-        refractive_index: refractive index of the surfaces; None: the value in ``scene.json``, else 1.5.
+        run: trained run of the scene, as in ``results.rendering.pictures.write_priors``.
+        views: views to write, as in ``write_priors``.
+        refractive_index: refractive index of the surfaces. If None, the value in ``scene.json`` is used, or else 1.5.
+        threshold: smallest DoLP of a used normal, as in ``write_priors``.
         reading: options of reading a scene folder.
-        formats: formats of the maps of ``shot_priors`` (png, exr, npy, page), written to a folder for each view.
-        shots: ``full_well``, ``read_noise`` and ``snr`` for the maps.
+        formats: formats of the maps of ``shot_priors`` (png, exr, npy, page). Each view gets its own folder.
+        shots: options for the maps. Only ``full_well``, ``read_noise`` and ``snr`` apply.
         reporter: receiver of progress and messages.
 
     Returns:
@@ -67,9 +69,9 @@ def priors(
         hint = " With --formats it applies to the maps." if given[0] in _OF_MAPS else ""
         raise PolarguideError(
             shots.label(given[0]),
-            expected="shots",
+            expected="single shots, to which the option applies",
             found="a scene with poses",
-            remedy=f"Leave it out: the scene has developed pictures and cameras.{hint}",
+            remedy=f"Remove the option, because a scene contains pictures and cameras that are ready to use.{hint}",
         )
     refuse_scene(Path(out))
     loaded = scene if isinstance(scene, Scene) else read_scene(scene, reading, reporter)
@@ -102,10 +104,11 @@ def shot_priors(
     Args:
         paths: files and folders of shots, see ``find_shots``.
         out: folder to write, with a folder for each shot.
-        refractive_index: refractive index of the surfaces; None: the value in ``scene.json`` of a single folder, else
-            1.5.
-        shots, intrinsics: see ``write_shots``.
-        formats: see ``write_shots``; None: all formats.
+        refractive_index: refractive index of the surfaces. If None, the value in ``scene.json`` is used if there is
+            only one folder, or else 1.5.
+        shots: options of reading, see ``write_shots``.
+        formats: formats of the maps, see ``write_shots``. If None, all formats are written.
+        intrinsics: intrinsics of the developed pictures, see ``write_shots``.
         reporter: receiver of progress and messages.
 
     Raises:

@@ -1,4 +1,4 @@
-"""Search for exposure sets in paths: mosaics, shots through a filter at four or any angles, views of a scene."""
+"""Find shots in files and folders: mosaics, pictures through a filter at any angles, and views of a scene."""
 
 from __future__ import annotations
 
@@ -31,24 +31,25 @@ from polarguide_shots.sets import ExposureSet, known_indices
 _EXPECTED = "raw mosaics with --sensor, or shots with angles in their names"
 _REMEDY = (
     f"Raw mosaics need --sensor: {SENSOR_NAMES}; shots need their angles in the names "
-    "(<shot>_0, _45, _90 and _135; at others <shot>_a10, _a40, ...), folders 0, 45, 90 and 135, or angles.csv with the "
-    "columns file,angle."
+    "(<shot>_0, _45, _90 and _135; at other angles <shot>_a10, _a40, ...), folders 0, 45, 90 and 135, or angles.csv "
+    "with the columns file,angle."
 )
 
 
 def find_shots(
     paths: Sequence[str | os.PathLike[str]], options: ShotOptions | None = None
 ) -> list[ExposureSet]:
-    """Find the exposure sets in files and folders, in the order of the paths, sorted within a folder.
+    """Find the shots in files and folders. They are in the order of the paths, and sorted within a folder.
 
-    A file is a mosaic if the options name a sensor. The name of another file states its shot and angle
+    A file is a mosaic if the options name a sensor. Otherwise the name of a file states its shot and angle
     (``cup_0.png``, ``cup_45.png``; ``I0.png`` ... in one folder; ``0/cup.png`` ...). Pictures of a shot at three or
-    more other angles are a set. Their angles are in the names (``cup_a10.png``, ``cup_a40.png``, ...) or in a table
-    ``angles.csv`` like that of ``prepare``. A video with a table ``frame,angle`` of its name is also a set. A folder is
-    a scene (``polar/``, or four folders of angles next to ``sparse``), or contains mosaics or shots. A folder without
-    shots is searched one level down.
+    more other angles form a set. Their angles are in the names (``cup_a10.png``, ``cup_a40.png``, ...) or in a table
+    ``angles.csv`` like that of ``prepare``. A video is also a set if a table ``frame,angle`` with the same name exists.
+    A folder is a scene (``polar/``, or four folders of angles next to ``sparse``), or contains mosaics or shots. In a
+    folder without shots, the subfolders are searched.
 
-    An ambiguous file, or a file without an angle, is a set with a ``fault``. Other shots are not affected.
+    An ambiguous file, or a file without an angle, is returned as a set with a ``fault``. The remaining shots are not
+    affected.
 
     Args:
         paths: files and folders.
@@ -60,7 +61,11 @@ def find_shots(
     """
     options = options or ShotOptions()
     require(
-        paths, "paths", expected="at least one file or folder of shots", found="none", remedy="Name some."
+        paths,
+        "paths",
+        expected="at least one file or folder of shots",
+        found="none",
+        remedy="Specify some paths.",
     )
     shots = list_shots(paths, options)
     faults = [shot.fault for shot in shots if shot.empty and shot.fault is not None]
@@ -77,7 +82,7 @@ def find_shots(
 def list_shots(
     paths: Sequence[str | os.PathLike[str]], options: ShotOptions | None = None
 ) -> list[ExposureSet]:
-    """Find exposure sets like ``find_shots``, but return sets with faults even if no set is valid.
+    """Find shots like ``find_shots``, but do not raise an error if all of them have faults.
 
     Args:
         paths: files and folders.
@@ -105,7 +110,11 @@ def list_shots(
 
 
 def mosaics(files: Sequence[Path]) -> list[ExposureSet]:
-    """Create a set of each raw mosaic. The names of files with one folder and stem include their suffix."""
+    """Create one ``ExposureSet`` for each raw mosaic.
+
+    A set is named like its file without the suffix. If two files in a folder differ only in their suffixes, the names
+    contain the suffixes.
+    """
     stems = Counter(path.with_suffix("") for path in files)
     return [
         ExposureSet(
@@ -116,7 +125,11 @@ def mosaics(files: Sequence[Path]) -> list[ExposureSet]:
 
 
 def _of_files(files: list[Path], options: ShotOptions) -> list[ExposureSet]:
-    """Find the sets in files: mosaics, or videos, sets in tables, shots in folders of angles, and shots by names."""
+    """Find the shots in files.
+
+    With a sensor, all files are mosaics. Otherwise the files are videos, pictures in a table, pictures in folders of
+    angles, or pictures with angles in their names.
+    """
     if options.sensor is not None:
         return mosaics(files)
     shots = sets.videos(files)
@@ -145,14 +158,14 @@ def _of_files(files: list[Path], options: ShotOptions) -> list[ExposureSet]:
 
 
 def _by_names(files: Sequence[Path]) -> list[ExposureSet]:
-    """Find sets, shots of four, and faults of other files, by the names of files."""
+    """Find shots by the names of files. A file without an angle in its name becomes a set with a fault."""
     named, rest = sets.by_name(files)
     by_name, others = filter_shots.group_files(rest)
     return [*named, *_filter_sets(by_name), *_without_angle(others)]
 
 
 def _filter_sets(shots: filter_shots.Candidates) -> list[ExposureSet]:
-    """Create the sets of four angles. Two files of one angle are a fault."""
+    """Create the sets at the four usual angles. A set has a fault if two files have the same angle."""
     return [
         ExposureSet(
             view,
@@ -166,7 +179,7 @@ def _filter_sets(shots: filter_shots.Candidates) -> list[ExposureSet]:
 
 
 def _without_angle(files: Sequence[Path]) -> list[ExposureSet]:
-    """Create a fault for each picture without an angle in its name."""
+    """Create a set with a fault for each picture, because its name contains no angle."""
     return [
         ExposureSet(
             path.name,
@@ -182,7 +195,7 @@ def _without_angle(files: Sequence[Path]) -> list[ExposureSet]:
 def _or_fault(
     folder: Path, options: ShotOptions, look: Callable[[Path, ShotOptions], list[ExposureSet]]
 ) -> list[ExposureSet]:
-    """Find the shots of a folder with ``look``, or return its fault."""
+    """Find the shots of a folder with ``look``. If that fails, return a set with the error as its fault."""
     try:
         return look(folder, options)
     except PolarguideError as error:
@@ -198,7 +211,7 @@ def _or_fault(
 
 
 def _in_folder(root: Path, options: ShotOptions) -> list[ExposureSet]:
-    """Find the shots in a folder, or in its folders if it has no valid shot.
+    """Find the shots in a folder. If it has no valid shot, find the shots in its subfolders.
 
     Raises:
         PolarguideError: there are no shots.
@@ -216,7 +229,7 @@ def _in_folder(root: Path, options: ShotOptions) -> list[ExposureSet]:
 
 
 def _directly_in(root: Path, options: ShotOptions) -> list[ExposureSet]:
-    """Find the shots in a folder without its folders.
+    """Find the shots in a folder, without its subfolders.
 
     Raises:
         PolarguideError: the folder is an invalid scene, or its table cannot be read.
@@ -241,7 +254,7 @@ def _directly_in(root: Path, options: ShotOptions) -> list[ExposureSet]:
 
 
 def _views(layout: CaptureFiles) -> list[ExposureSet]:
-    """Create the sets of the views of a scene. Pictures that do not determine Stokes vectors are a fault.
+    """Create the sets of the views of a scene. A set has a fault if its pictures do not determine Stokes vectors.
 
     Raises:
         PolarguideError: no view is valid.
@@ -266,7 +279,10 @@ def _views(layout: CaptureFiles) -> list[ExposureSet]:
 
 
 def _unique_names(shots: list[ExposureSet]) -> list[ExposureSet]:
-    """Add the folder to equal names. Names that are still equal, or invalid for a folder, are a fault."""
+    """Make the names of shots unique by adding the name of the folder.
+
+    A shot gets a fault if its name is still not unique, or is invalid as the name of a folder.
+    """
     counts = Counter(shot.name for shot in shots)
     unique = [
         replace(
@@ -288,14 +304,17 @@ def _unique_names(shots: list[ExposureSet]) -> list[ExposureSet]:
                 shot.paths[0],
                 expected="one shot of each name",
                 found=f"{shot.name} also at {others[0].paths[0]}",
-                remedy="Rename one of them, or give them in two calls.",
+                remedy="Rename one of the shots, or read them in separate calls.",
             )
             unique[place] = replace(shot, fault=shot.fault or fault)
     return unique
 
 
 def name_fault(shot: ExposureSet) -> PolarguideError | None:
-    """Return the error of a name that is invalid for a folder, because files would be written elsewhere."""
+    """Return an error if the name of a shot is invalid as the name of a folder, else None.
+
+    With such a name, files would be written into a different folder.
+    """
     name = shot.name
     if name not in ("", ".", "..") and os.sep not in name and not (os.altsep and os.altsep in name):
         return None
@@ -308,7 +327,7 @@ def name_fault(shot: ExposureSet) -> PolarguideError | None:
 
 
 def require_own_folder(shot: ExposureSet, folder: Path) -> None:
-    """Check that no file of a shot is in the folder of its maps, where it may have the name of a map.
+    """Check that the files of a shot are not in the folder of its maps, where a map may have the same name.
 
     Raises:
         PolarguideError: a file of the shot is in ``folder``.
@@ -324,7 +343,7 @@ def require_own_folder(shot: ExposureSet, folder: Path) -> None:
 
 
 def require_elsewhere(paths: Sequence[str | os.PathLike[str]], out: Path) -> None:
-    """Check that the output folder is not searched for shots. The next call would read the written files as shots.
+    """Check that the output folder is not searched for shots. Otherwise the next call would read its files as shots.
 
     Raises:
         PolarguideError: ``out`` is one of the searched folders.

@@ -1,4 +1,7 @@
-"""Maps of a set of pictures at any angles: noise, weighted least squares of each pixel, covariance and outliers."""
+"""Compute maps from pictures at any polarizer angles, by weighted least squares at each pixel.
+
+The module also estimates the noise, removes outliers, and computes the covariance of the Stokes vectors.
+"""
 
 from __future__ import annotations
 
@@ -27,19 +30,19 @@ from polarguide_shots.options import ShotOptions
 
 Floats = NDArray[np.float64]
 _REDUNDANT = 0.05
-"""Smallest share of a sample's noise in the residual of a fit from which noise is estimated."""
+"""Smallest share of a sample's noise that must remain in the residual of a fit, to estimate noise from it."""
 
 
 def estimated_set_noise(samples: SetSamples, gray: Floats, used: NDArray[np.bool_]) -> NoiseModel:
-    """Fit ``floor + slope * intensity`` to the residuals of the pictures of a set.
+    """Fit a noise model ``floor + slope * intensity`` to the residuals of the pictures of a set.
 
-    The expected sum of squared residuals of a pixel is the sum of (1 - h) times the variances of its samples with the
+    The expected sum of squared residuals of a pixel is the sum of (1 - h) times the variances of its samples, with the
     leverages h. It therefore measures the noise at the mean intensity with these weights. The median in each bin of
-    brightness is robust against moved edges.
+    brightness is robust against edges that moved between pictures.
 
     Args:
-        samples: the set.
-        gray: luminance [K, N] at some pixels.
+        samples: samples of the set.
+        gray: luminance [K, N] of the K pictures at N pixels.
         used: mask [K] of the pictures that are fitted.
     """
     least = samples.step**2 / 12 / samples.values.shape[-1]
@@ -58,10 +61,11 @@ def estimated_set_noise(samples: SetSamples, gray: Floats, used: NDArray[np.bool
 
 
 def neighbor_noise(samples: SetSamples) -> NoiseModel:
-    """Fit ``floor + slope * intensity`` to differences of neighboring pixels, for sets without residuals.
+    """Fit a noise model ``floor + slope * intensity`` to differences of neighboring pixels.
 
-    The difference of a pixel and the mean of its left and right neighbor has 3/2 of its variance. Texture adds to it:
-    the result is an upper bound of the noise.
+    It serves sets with too few pictures for residuals. The difference between a pixel and the mean of its left and
+    right neighbor has 3/2 of the variance of a pixel. Texture increases the difference, so the result is an upper bound
+    of the noise.
     """
     least = samples.step**2 / 12 / samples.values.shape[-1]
     height, width = samples.dark.shape
@@ -77,24 +81,24 @@ def neighbor_noise(samples: SetSamples) -> NoiseModel:
 
 
 FALSE_ALARMS = 1e-3
-"""Share of pixels of pure noise that lose a sample as an outlier."""
+"""Share of pixels that lose a sample as an outlier although they contain only noise."""
 DARK_SNR = 3.0
-"""Smallest S0 of a pixel that is not dark, in units of its noise."""
+"""Smallest ratio of S0 to its noise at a pixel that is not dark."""
 _TILE = 1 << 14
 """Batch size in pixels. The samples of 36 pictures then fit into the processor's cache."""
 _PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
-"""Indices into a symmetric matrix, in the order of ``optics.fitted_uncertainty``."""
+"""Row and column of each stored entry of a symmetric matrix, in the order of ``optics.fitted_uncertainty``."""
 Array = NDArray[np.float32]
 
 
 @dataclass(eq=False)
 class SetFit:
-    """Fit of some pixels.
+    """Result of fitting Stokes vectors to N pixels of K pictures.
 
     Attributes:
-        stokes: [3, N] of the luminance.
-        covariance: [6, N], in the order of ``_PAIRS``.
-        weights: [K, N], 0 for samples that are left out.
+        stokes: [3, N] Stokes vectors of the luminance.
+        covariance: [6, N] covariances of the Stokes vectors, in the order of ``_PAIRS``.
+        weights: [K, N] weights of the samples, 0 for samples that are left out.
         determined: mask [N] of pixels whose samples determine a Stokes vector.
     """
 
@@ -105,13 +109,13 @@ class SetFit:
 
 
 class SetModel:
-    """Malus's law at the angles of a set, with the noise of its samples.
+    """Model of the intensities of a set: Malus's law at the angles of its pictures, and the noise.
 
     Args:
-        samples: the set.
+        samples: samples of the set.
         used: mask [K] of the pictures that are fitted.
         noise: noise of a sample.
-        share: variance of a luminance over the variance of a sample.
+        share: ratio of the variance of a luminance to the variance of a sample.
     """
 
     def __init__(self, samples: SetSamples, used: NDArray[np.bool_], noise: NoiseModel, share: float) -> None:
@@ -121,14 +125,14 @@ class SetModel:
         gains = samples.gains[:, None]
         self._floor = np.float32(noise.floor * share) / gains**2
         self._slope = np.float32(noise.slope * share) / gains
-        self._limit = 2 * float(erfcinv(FALSE_ALARMS / len(used))) ** 2  # squared, two-sided
+        self._limit = 2 * float(erfcinv(FALSE_ALARMS / len(used))) ** 2  # squared limit, two-sided test
 
     def variances(self, stokes: Array) -> Array:
-        """Predict the variances [K, N] of the samples of Stokes vectors [3, N]."""
+        """Predict the variances [K, N] of the samples from Stokes vectors [3, N]."""
         return np.asarray(self._floor + self._slope * np.maximum(self.rows @ stokes, 0), np.float32)
 
     def fit(self, gray: Array, lost: NDArray[np.bool_]) -> SetFit:
-        """Fit pixels by least squares, repeat with the predicted variances, and remove outliers.
+        """Fit Stokes vectors by least squares, repeat the fit with predicted variances, and remove outliers.
 
         Args:
             gray: luminance [K, N].
@@ -136,7 +140,7 @@ class SetModel:
         """
         usable = (~lost & self._used[:, None]).astype(np.float32)
         determined = self._determined(usable)
-        usable[:, ~determined] = 1  # pictures show a fit at these pixels as well
+        usable[:, ~determined] = 1  # such pixels also get a value, for the pictures of the maps
         stokes, _ = self._solve(usable, gray)
         weights = usable / self.variances(stokes)
         fit = SetFit(*self._solve(weights, gray), weights, determined)
@@ -144,11 +148,11 @@ class SetModel:
         return fit
 
     def _drop_outliers(self, gray: Array, fit: SetFit) -> None:
-        """Remove the sample with the largest residual of each pixel, while a residual exceeds the noise."""
+        """Remove the sample with the largest residual of each pixel, until all residuals agree with the noise."""
         doubled = self._squares * np.array([[1], [2], [2], [1], [2], [1]], np.float32)
         at = np.flatnonzero(fit.determined)
         while at.size:
-            # Four samples have equal residuals, which do not identify an outlier.
+            # With four samples, all residuals are equal and do not identify an outlier.
             at = at[(fit.weights[:, at] > 0).sum(axis=0) >= 5]
             weights = fit.weights[:, at]
             leverage = weights * (doubled.T @ fit.covariance[:, at])
@@ -165,7 +169,10 @@ class SetModel:
             fit.stokes[:, at], fit.covariance[:, at] = self._solve(weights, gray[:, at])
 
     def _determined(self, usable: Array) -> NDArray[np.bool_]:
-        """Return a mask [N] of pixels whose samples, [K, N] of 0 and 1, determine a Stokes vector well."""
+        """Return a mask [N] of pixels whose usable samples determine a Stokes vector well.
+
+        ``usable`` is [K, N], 1 for a usable sample and 0 otherwise.
+        """
         determined = np.ones(usable.shape[1], bool)
         some = np.flatnonzero(usable.sum(axis=0) < self._used.sum())
         if some.size:
@@ -178,7 +185,11 @@ class SetModel:
         return determined
 
     def _solve(self, weights: Array, values: Array) -> tuple[Array, Array]:
-        """Solve weighted least squares of [K, N]: Stokes vectors [3, N], and the inverse normal matrix [6, N]."""
+        """Solve weighted least squares at each pixel for values [K, N].
+
+        Returns:
+            Stokes vectors [3, N]; and inverse normal matrices [6, N].
+        """
         a, b, c, d, e, f = (self._squares @ weights).astype(np.float64)
         # Cofactors of the symmetric matrix ((a, b, c), (b, d, e), (c, e, f)).
         inverse = np.stack(
@@ -188,14 +199,17 @@ class SetModel:
         return self.project(inverse, weights, values), inverse.astype(np.float32)
 
     def project(self, inverse: NDArray[Any], weights: Array, values: Array) -> Array:
-        """Return the Stokes vectors [3, N] of samples [K, N], given the inverse normal matrix."""
+        """Return the Stokes vectors [3, N] of values [K, N], given the inverse normal matrices."""
         x, y, z = (self.rows.T @ (weights * values)).astype(np.float64)
         p, q, r, s, t, u = inverse
         stokes = np.stack((p * x + q * y + r * z, q * x + s * y + t * z, r * x + t * y + u * z))
         return stokes.astype(np.float32)
 
     def residual(self, gray: Array, stokes: Array) -> Array:
-        """Return the root mean square residual of all samples, [N], in standard deviations per degree of freedom."""
+        """Return the root mean square residual [N] of all samples of a pixel.
+
+        Its unit is the standard deviation of the noise, per degree of freedom.
+        """
         squares = (gray - self.rows @ stokes) ** 2 / self.variances(stokes)
         return np.sqrt(squares.sum(axis=0) / (len(gray) - 3))
 
@@ -248,18 +262,18 @@ def maps_of_set(name: str, files: tuple[Path, ...], samples: SetSamples, options
 
 
 _FLOAT_MAPS = ("dolp", "dolp_debiased", "aolp", "sigma_dolp", "sigma_aolp", "residual")
-"""Names of the maps [H, W] of 32-bit floats."""
+"""Names of the maps that are stored as 32-bit floats."""
 
 
 def _fill(maps: dict[str, Any], part: slice, samples: SetSamples, model: SetModel, snr: float) -> None:
     """Fit the pixels of some rows, and store their values in the maps.
 
     Args:
-        maps: maps by name.
+        maps: maps by name, which are modified.
         part: the rows.
-        samples: the pictures.
+        samples: samples of the set.
         model: angles and noise of the pictures.
-        snr: smallest DoLP of a pixel with a valid angle, in standard deviations.
+        snr: smallest ratio of the DoLP to its standard deviation at a pixel with a valid angle.
     """
     values = samples.intensities(part)
     count, height, width, channels = values.shape

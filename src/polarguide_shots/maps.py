@@ -1,4 +1,4 @@
-"""Maps of one exposure set, the reasons against a pixel, and the noise of samples."""
+"""Polarization maps of a shot, the reasons to reject pixels, and the noise of samples."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Map = NDArray[np.float32]
 
 
 class Reason(enum.IntEnum):
-    """Reasons why a pixel has no valid angle. A later reason replaces an earlier one."""
+    """Reason why a pixel has no valid angle. If several reasons apply, the one with the largest number is stored."""
 
     USABLE = 0
     NOISE = 1
@@ -38,17 +38,17 @@ REASONS = {
     Reason.SATURATED: "saturated: a sample of the pixel is at full scale",
     Reason.MASKED: "masked: marked as invalid, or outside of the mask",
 }
-"""Descriptions of the reasons."""
+"""Description of each reason for users."""
 
 
 @dataclass(frozen=True)
 class NoiseModel:
-    """Noise of one sample of the sensor: variance ``floor + slope * intensity`` (photon transfer, EMVA 1288).
+    """Noise of one sample of the sensor: its variance is ``floor + slope * intensity`` (photon transfer, EMVA 1288).
 
     Attributes:
-        floor: variance without light (read-out, quantization), in full scales squared.
-        slope: full scales of variance per full scale of intensity, 1 / electrons at full scale.
-        source: "given" by the user or "estimated" from the picture.
+        floor: variance without light, in full scales squared. It contains read noise and quantization.
+        slope: increase of the variance with the intensity, both in full scales. It is 1 / electrons at full scale.
+        source: "given" if the user specified the noise, "estimated" if it is estimated from the picture.
     """
 
     floor: float
@@ -58,38 +58,39 @@ class NoiseModel:
 
 @dataclass(frozen=True, eq=False)
 class ShotMaps:
-    """Maps of one shot, NumPy arrays at the size of the developed picture.
+    """Polarization maps of one shot, as NumPy arrays at the size of the developed picture.
 
     DoLP and AoLP of a color picture refer to its luminance, the plain mean of the Stokes vectors of R, G and B. Angles
     and degrees of polarization are never averaged. The colors are in ``intensities``.
 
     Attributes:
         name: name of the shot.
-        files: files of the shot; four files are in the order 0, 45, 90, 135.
-        intensities: [4, H, W, C] float32, linear, at 0, 45, 90 and 135 degrees, counter-clockwise as displayed; 1 is
-            full scale. Noise about black may be negative. C is 3 (R, G, B) or 1 (monochrome). For a set at other
-            angles, the intensities follow from the fitted Stokes vectors.
-        stokes: [3, H, W] float32, of the luminance. S0 is 2 where all four intensities are at full scale; a photograph
-            shows S0 / 2.
+        files: files of the shot. Four files are in the order 0, 45, 90, 135.
+        intensities: [4, H, W, C] float32, linear, at 0, 45, 90 and 135 degrees counter-clockwise as displayed. 1 is
+            full scale. Noise around black may be negative. C is 3 (R, G, B) or 1 (monochrome). For a set at other
+            angles, the intensities are computed from the fitted Stokes vectors.
+        stokes: [3, H, W] float32, Stokes vectors of the luminance. S0 is 2 where all four intensities are at full
+            scale. A photograph shows S0 / 2.
         dolp: [H, W] float32 in [0, 1], as measured.
         dolp_debiased: [H, W] float32 in [0, 1], without the mean bias by noise.
         aolp: [H, W] float32, radians in [0, pi).
-        sigma_dolp: [H, W] float32, standard deviation of ``dolp``; infinite without light.
-        sigma_aolp: [H, W] float32, standard deviation of ``aolp``, radians, at most ``optics.UNIFORM_SPREAD``.
-        reason: [H, W] uint8, a ``Reason``. NOISE pixels have a valid S0 and a small DoLP, which count in means over a
-            region. Their angles and normals are not valid.
+        sigma_dolp: [H, W] float32, standard deviation of ``dolp``. It is infinite without light.
+        sigma_aolp: [H, W] float32, standard deviation of ``aolp``, radians. Its maximum is ``optics.UNIFORM_SPREAD``.
+        reason: [H, W] uint8, a ``Reason``. Pixels with the reason NOISE have a valid S0 and a small DoLP, which count
+            in means over a region. Their angles and normals are not valid.
         noise: noise of one sample of the sensor.
-        pair_ratio: median of (I0 + I90) / (I45 + I135), 1 for ideal polarizers; None for a dark shot or a set.
-        notes: assumptions, for the user.
-        pictures: comparison of the pictures of a set with one another; empty for other shots.
-        residual: [H, W] float32, root mean square residual of the fit of more than three pictures, in standard
-            deviations of their noise and per degree of freedom. Noise alone gives 1; motion, clipping and wrong angles
-            give more. None for other shots.
-        left_out: [H, W] uint8, number of samples of a set that were not fitted because they are clipped or outliers;
-            None for other shots.
-        pixel_variance: mean variance of a developed intensity (of the luminance), in variances of a sample.
-        mean_variance: variance of the mean of many developed intensities, times their number. It exceeds
-            ``pixel_variance`` because neighbors share samples. None for a set.
+        pair_ratio: median of (I0 + I90) / (I45 + I135), which is 1 for ideal polarizers. None for a dark shot or a set.
+        notes: sentences for the user about assumptions.
+        pictures: comparison of the pictures of a set with one another. Empty for other shots.
+        residual: [H, W] float32, root mean square residual of a fit to more than three pictures. The unit is the
+            standard deviation of the noise, per degree of freedom: noise alone gives 1, while motion, clipping and
+            wrong angles give more. None for other shots.
+        left_out: [H, W] uint8, number of samples of a set that were left out of the fit because they are clipped or
+            outliers. None for other shots.
+        pixel_variance: ratio of the mean variance of a developed intensity (of the luminance) to the variance of a
+            sample.
+        mean_variance: variance of the mean of many developed intensities, multiplied by their number. It exceeds
+            ``pixel_variance`` because neighboring pixels share samples. None for a set.
         origin: column and row of the first pixel of the maps in the developed picture.
         whole: width and height of the developed picture if the maps are a part of it, else None.
     """
@@ -122,7 +123,7 @@ class ShotMaps:
 
     @property
     def s0(self) -> Map:
-        """S0 of the luminance, [H, W]; a photograph shows half of it."""
+        """S0 of the luminance, [H, W]. A photograph without a polarizer shows half of it."""
         return np.asarray(self.stokes[0])
 
     @property
@@ -132,7 +133,7 @@ class ShotMaps:
 
     @property
     def measured(self) -> NDArray[np.bool_]:
-        """Mask of the pixels with a valid S0 and DoLP, [H, W]: usable pixels, and pixels with the reason NOISE."""
+        """Mask [H, W] of the pixels with a valid S0 and DoLP: usable pixels, and pixels with the reason NOISE."""
         return np.asarray(self.reason <= Reason.NOISE)
 
     @property
@@ -146,11 +147,16 @@ _SAMPLES = 400_000
 _BINS = 24
 _FEWEST = 200
 _REACH = 16
-"""Pixels between two impulses, more than twice the reach of any interpolation."""
+"""Distance in pixels between two test impulses. It exceeds twice the reach of any interpolation."""
 
 
 def given_noise(options: ShotOptions, step: float) -> NoiseModel | None:
-    """Return the noise that the options state, or None. ``step``: one stored value as a share of full scale."""
+    """Return the noise that the user specified in the options, or None if the options contain no noise.
+
+    Args:
+        options: options of the shot.
+        step: difference between two successive stored values, as a share of full scale.
+    """
     if options.full_well is None:
         return None
     read = options.read_noise / options.full_well
@@ -158,16 +164,17 @@ def given_noise(options: ShotOptions, step: float) -> NoiseModel | None:
 
 
 def estimated_noise(intensities: Any, usable: NDArray[np.bool_], step: float) -> NoiseModel:
-    """Fit ``floor + slope * intensity`` to the variance of ``I0 + I90 - I45 - I135``.
+    """Fit a noise model ``floor + slope * intensity`` to the variance of ``I0 + I90 - I45 - I135``.
 
     Four angles measure three unknowns. The difference is therefore zero except for noise, and has four times the
     variance of a sample. Linear gradients cancel in a cell of four pixels. The median in each bin of brightness removes
     unequal gains. The median of absolute differences is robust against edges.
 
     Args:
-        intensities: four arrays of one shape, by angle, of cells or of pixels.
+        intensities: four arrays of the same shape, one for each angle, of cells or of pixels.
         usable: mask in this shape of samples that are not dark or saturated.
-        step: one stored value as a share of full scale, which bounds the noise from below.
+        step: difference between two successive stored values, as a share of full scale. It gives a lower bound of the
+            noise.
     """
     chosen = np.flatnonzero(usable)
     chosen = chosen[:: max(1, len(chosen) // _SAMPLES)]
@@ -190,11 +197,11 @@ def estimated_noise(intensities: Any, usable: NDArray[np.bool_], step: float) ->
 def binned_noise(
     levels: NDArray[np.float64], variance: Callable[[NDArray[np.intp]], float], least: float
 ) -> NoiseModel:
-    """Fit the noise of samples to their variances in bins of brightness.
+    """Fit a noise model to the variances of samples in bins of brightness.
 
     Args:
         levels: intensities of the samples, [N].
-        variance: function of indices of samples that returns their variance.
+        variance: function that returns the variance of the samples with the given indices.
         least: lower bound of the variance.
     """
     parts = np.array_split(np.argsort(levels), min(_BINS, max(1, len(levels) // _FEWEST)))
@@ -204,7 +211,7 @@ def binned_noise(
 
 
 def noise_line(x: NDArray[np.float64], y: NDArray[np.float64], least: float) -> tuple[float, float]:
-    """Fit a line with nonnegative floor and slope to variances, whose errors are proportional to them."""
+    """Fit a line to variances. Floor and slope are not negative, and errors are proportional to the variances."""
     weight = 1 / y
     floor = float(y.mean())
     slope = 0.0
@@ -224,7 +231,7 @@ def noise_line(x: NDArray[np.float64], y: NDArray[np.float64], least: float) -> 
 
 @lru_cache(maxsize=8)
 def interpolation_factors(sensor: str, x: int, y: int, mode: str) -> tuple[NDArray[np.float32], float]:
-    """Compute the variance of developed intensities as a multiple of the variance of a sample.
+    """Compute how much noise demosaicing leaves in the developed intensities.
 
     Interpolated values are means of samples and have less noise. The weights of the samples are the responses of the
     demosaicing to an impulse at each position of the pattern. Guided interpolation, which is not linear, is treated as
@@ -232,12 +239,14 @@ def interpolation_factors(sensor: str, x: int, y: int, mode: str) -> tuple[NDArr
 
     Args:
         sensor: name of the sensor.
-        x, y: column and row of the first sample in the sensor.
+        x: column of the first sample in the sensor.
+        y: row of the first sample in the sensor.
         mode: mode of demosaicing.
 
     Returns:
-        Factors [4, p, p] over a period p of the pattern, and the variance of the mean of many intensities times their
-        number. The latter exceeds the mean of the factors because interpolated neighbors share samples.
+        Two results. The first contains factors [4, p, p] over a period p of the pattern. A factor is the variance of an
+        intensity, divided by the variance of a sample. The second is the variance of the mean of many intensities,
+        multiplied by their number. It exceeds the mean of the factors because neighboring pixels share samples.
     """
     pattern = sensor_pattern(sensor).shifted(x, y)
     side = 4 * _REACH
@@ -272,15 +281,21 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True, eq=False)
 class Developed:
-    """Developed intensities of a shot.
+    """Developed intensities of a shot, from which the maps are computed.
 
     Attributes:
-        intensities: [4, H, W, C] float32, linear; noise about black may be negative.
-        dark, saturated, masked: masks [H, W].
+        intensities: [4, H, W, C] float32, linear. Noise around black may be negative.
+        dark: mask [H, W] of dark pixels.
+        saturated: mask [H, W] of saturated pixels.
+        masked: mask [H, W] of pixels that are masked out.
         noise: noise of a sample.
-        factors: variance of an intensity (of the luminance) as a multiple of the variance of a sample, [4, p, p] over a
-            period of pixels.
-        mean_variance, pair_ratio, notes, origin, whole: as in ``ShotMaps``.
+        factors: [4, p, p] variance of an intensity (of the luminance), divided by the variance of a sample, over a
+            period of p pixels.
+        mean_variance: as in ``ShotMaps``.
+        pair_ratio: as in ``ShotMaps``.
+        notes: as in ``ShotMaps``.
+        origin: as in ``ShotMaps``.
+        whole: as in ``ShotMaps``.
     """
 
     intensities: Map
@@ -297,4 +312,4 @@ class Developed:
 
 
 Part = tuple[int, int, int, int]
-"""Column, row, width and height of a part of a picture."""
+"""Type of a part of a picture, as column, row, width and height."""

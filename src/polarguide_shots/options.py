@@ -1,4 +1,7 @@
-"""Options of shots, of measurements and of watched folders. This module does not import torch or OpenCV."""
+"""Options for reading shots, for measuring them, and for watching a folder.
+
+This module does not import torch or OpenCV.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +29,8 @@ from polarguide.core.records import option_name
 Kind = Literal["mosaic", "filter", "set", "scene"]
 """Kind of a shot.
 
-One mosaic, four files at 0, 45, 90 and 135 degrees, pictures at any angles, or a view of a scene.
+A "mosaic" is one raw file. A "filter" shot has four files at 0, 45, 90 and 135 degrees. A "set" has pictures at any
+angles. A "scene" shot is a view of a scene.
 """
 _KINDS: dict[Kind, tuple[str, str, type[CameraOptions]]] = {
     "mosaic": ("a raw mosaic", "raw mosaics", RawMosaicOptions),
@@ -34,7 +38,7 @@ _KINDS: dict[Kind, tuple[str, str, type[CameraOptions]]] = {
     "set": ("a set at other angles", "sets at other angles", SetOptions),
     "scene": ("a view of a scene", "views of a scene", EncodedOptions),
 }
-"""Singular and plural of the kinds in messages, and the types of their options."""
+"""Description of each kind of shot in the singular and plural, and the type of its options."""
 _OPTION_OF = {"analyzers": "--calibration (of polarguide calibrate)", "align": "--no-align"}
 
 
@@ -74,14 +78,14 @@ class ShotOptions(RawOptions):
         require(
             not self.read_noise or self.full_well is not None,
             "--read-noise",
-            expected="--full-well next to it; without it, the noise is estimated from each shot",
+            expected="--full-well together with --read-noise",
             found=f"{self.read_noise:g} without --full-well",
-            remedy="Give --full-well, or leave it out.",
+            remedy="Specify --full-well as well, or remove --read-noise: the noise is then estimated from each shot.",
         )
         return self
 
     def label(self, name: str) -> str:
-        """Return the name of an option in messages; for the calibration, its contents."""
+        """Return the text for an option in messages. For the calibration, it lists the contents."""
         if name == "calibration":
             return f"calibration ({', '.join(changed(self.calibration))})"
         return _OPTION_OF.get(name, option_name(name))
@@ -101,16 +105,16 @@ class ShotOptions(RawOptions):
             hint = " Raw mosaics need --sensor." if owners == ["raw mosaics"] and self.sensor is None else ""
             raise PolarguideError(
                 self.label(option),
-                expected=f"{' and '.join(owners)}, which the option applies to",
+                expected=f"{' and '.join(owners)}, to which the option applies",
                 found=f"{name}, {singular}",
-                remedy=f"Leave it out; it has no effect there.{hint}",
+                remedy=f"Remove the option, because it would have no effect.{hint}",
             )
         require(
             kind != "scene" or self.calibration.gains is None,
             "calibration (gains)",
-            expected="raw mosaics and shots through a filter, which gains apply to",
+            expected="raw mosaics and shots through a filter, to which gains apply",
             found=f"{name}, {singular}",
-            remedy="Leave the gains out; order, sense and zero apply. prepare --calibration corrects a scene.",
+            remedy="Remove the gains; order, sense and zero apply. prepare --calibration corrects gains.",
         )
 
 

@@ -1,4 +1,4 @@
-"""Reading of a shot from files or arrays (``read_shot``), and its normals and layers (``surface_maps``)."""
+"""Read a shot from files or arrays (``read_shot``), and compute its normals and layers (``surface_maps``)."""
 
 from __future__ import annotations
 
@@ -88,9 +88,9 @@ from polarguide_shots.samples import (
 from polarguide_shots.sets import ExposureSet, require_determined
 
 UNREADABLE = (PolarguideError, OSError, MemoryError)
-"""Exceptions of one shot that do not stop the others."""
+"""Exception types that mark one shot as unreadable, while the remaining shots are still processed."""
 _TILE = 1 << 18
-"""Batch size in pixels. Intermediate results then stay in the processor's cache."""
+"""Batch size in pixels. Intermediate results of a batch fit into the processor's cache."""
 
 
 def read_shot(
@@ -105,27 +105,29 @@ def read_shot(
     angles: Sequence[Angle] = ANGLES,
     part: Part | None = None,
 ) -> ShotMaps:
-    """Read one exposure set: S0, DoLP, AoLP, their standard deviations, and the reasons against pixels.
+    """Read one shot, and compute S0, DoLP, AoLP, their standard deviations, and the reasons to reject pixels.
 
-    A shot is one of these:
+    The argument ``shot`` can be:
 
     - a result of ``find_shots``, or a view of a scene
     - the path of a mosaic, of a video with its table, or of a folder with one shot
-    - the paths of shots through a filter at three or more angles
-    - with ``options.sensor``, a raw mosaic [H, W] of uint8 or uint16 in NumPy or torch
-    - pictures through a filter, [K, H, W] or [K, H, W, 3] RGB, or a list of K arrays: integers as stored, or linear
-      floats from 0 to 1
+    - the paths of pictures through a filter at three or more angles
+    - a raw mosaic [H, W] of uint8 or uint16 in NumPy or torch, if ``options.sensor`` names the sensor
+    - pictures through a filter, as an array [K, H, W] or [K, H, W, 3] RGB, or as a list of K arrays. Integers are
+      stored values. Floats are linear, from 0 to 1.
 
     Args:
         shot: the shot.
         options: options of reading.
-        angles: angles of the K pictures of an array, degrees counter-clockwise as displayed. Files state their angles.
-        part: requested part of the picture of a mosaic. The rest is skipped if that saves time, see ``ShotMaps.origin``
-            and ``ShotMaps.whole``. The noise is then estimated from the part unless the options state it.
+        angles: angles of the K pictures of an array, in degrees counter-clockwise as displayed. Files state their own
+            angles.
+        part: requested part of the picture of a mosaic. The remaining pixels are skipped if that saves time;
+            ``ShotMaps.origin`` and ``ShotMaps.whole`` describe the result. The noise is then estimated from the part
+            unless the options state it.
 
     Raises:
-        PolarguideError: the path is not one shot, a file is missing, cannot be read, or does not fit, or an array has
-            another shape or type.
+        PolarguideError: the path does not contain exactly one shot, a file is missing or cannot be read, the files do
+            not fit each other, or an array has an invalid shape or type.
     """
     options = (options or ShotOptions()).checked()
     if isinstance(shot, View):
@@ -152,7 +154,7 @@ def read_shot(
             paths[0],
             expected="one shot",
             found=f"{len(shots)}",
-            remedy="find_shots lists them; read them one by one.",
+            remedy="Find the shots with find_shots, and read each separately.",
         )
         shot = shots[0]
     if shot.fault is not None:
@@ -165,7 +167,7 @@ def read_shot(
 
 
 def fault_of(shot: ExposureSet, error: BaseException) -> PolarguideError:
-    """Convert one of ``UNREADABLE`` to an error that names the shot."""
+    """Convert an exception of a type in ``UNREADABLE`` to an error that names the shot."""
     if isinstance(error, PolarguideError):
         return error
     found = "too little free memory"
@@ -182,7 +184,7 @@ def fault_of(shot: ExposureSet, error: BaseException) -> PolarguideError:
 
 
 def tiles(height: int, width: int) -> Iterator[slice]:
-    """Split the rows of a picture into batches that start with a complete superpixel."""
+    """Split the rows of a picture into batches that start at the first row of a superpixel."""
     rows = max(1, _TILE // width // 4) * 4
     for top in range(0, height, rows):
         yield slice(top, min(top + rows, height))
@@ -190,11 +192,11 @@ def tiles(height: int, width: int) -> Iterator[slice]:
 
 @torch.no_grad()
 def maps_of(shot: ExposureSet, developed: Developed, options: ShotOptions) -> ShotMaps:
-    """Compute the maps of developed intensities.
+    """Compute the polarization maps of a shot from its developed intensities.
 
     Args:
         shot: name and files of the shot.
-        developed: its intensities.
+        developed: developed intensities of the shot.
         options: options of reading.
     """
     _, height, width, _ = developed.intensities.shape
@@ -247,23 +249,30 @@ def maps_of(shot: ExposureSet, developed: Developed, options: ShotOptions) -> Sh
 
 
 TOWARD = (0.0, -0.5, -1.0)
-"""Prior direction of normals in camera axes: toward the camera, and a little upward."""
+"""Direction in camera axes that normals are expected to have: toward the camera, and a little upward."""
 
 
 @dataclass(frozen=True, eq=False)
 class SurfaceMaps:
-    """Normals and layers of one shot, for a smooth dielectric under unpolarized light.
+    """Normals, and layers of specular and diffuse light, that a shot suggests for a smooth dielectric surface.
+
+    The computation assumes unpolarized illumination.
 
     Attributes:
-        zeniths: [3, H, W] float32, radians: zeniths with the DoLP of the pixel for diffuse light, and for specular
-            light below and above Brewster's angle. The six candidates of the normal have azimuth AoLP and AoLP + pi
-            (diffuse), AoLP + pi/2 and AoLP - pi/2 (specular). NaN for a DoLP that diffuse light cannot have.
-        normal: [H, W, 3] float32, the candidate nearest to ``TOWARD``, camera axes (x right, y down, z forward). This
-            choice is a guess. 0 for pixels without a valid angle.
-        specular_paper, diffuse_paper: [H, W, C] float32, units of S0: the coarse separation of PolarGuide-GSDR. It
-            needs no normal and uses the diffuse zenith of the DoLP. The layers do not add up to S0.
-        specular_exact, diffuse_exact: [H, W, C] float32, units of S0: separation by Fresnel's equations. It depends on
-            the guessed normal. The layers add up to S0.
+        zeniths: [3, H, W] float32, radians. The three zeniths have the DoLP of the pixel: the first for diffuse light,
+            the second and third for specular light below and above Brewster's angle. The normal has six candidates:
+            azimuth AoLP and AoLP + pi for diffuse light, AoLP + pi/2 and AoLP - pi/2 for specular light. The diffuse
+            zenith is NaN if diffuse light cannot have the DoLP.
+        normal: [H, W, 3] float32 in camera axes (x right, y down, z forward). It is the candidate nearest to
+            ``TOWARD``, which is a guess. Pixels without a valid angle have 0.
+        specular_paper: [H, W, C] float32 in units of S0, specular layer of the coarse separation of PolarGuide-GSDR. It
+            needs no normal and uses the diffuse zenith of the DoLP.
+        diffuse_paper: [H, W, C] float32 in units of S0, diffuse layer of the coarse separation. The two coarse layers
+            do not add up to S0.
+        specular_exact: [H, W, C] float32 in units of S0, specular layer by Fresnel's equations. It depends on the
+            guessed normal.
+        diffuse_exact: [H, W, C] float32 in units of S0, diffuse layer by Fresnel's equations. The two exact layers add
+            up to S0.
         conditioned: mask [H, W] of pixels at which the exact separation is well conditioned.
         refractive_index: refractive index of all surfaces.
         perspective: True if the rays of the pixels are known, False if they are assumed to be parallel to the axis.
@@ -281,7 +290,7 @@ class SurfaceMaps:
 
 
 def parse_intrinsics(text: str, size: tuple[int, int]) -> Camera:
-    """Parse ``fx,fy,cx,cy`` in pixels of a picture of ``size`` (width, height).
+    """Parse the intrinsics ``fx,fy,cx,cy``, in pixels of a picture of ``size`` (width, height).
 
     Raises:
         PolarguideError: the text is invalid.
@@ -300,7 +309,9 @@ def parse_intrinsics(text: str, size: tuple[int, int]) -> Camera:
 
 
 def camera_of(shot: ExposureSet, size: tuple[int, int], intrinsics: str | None) -> Camera | None:
-    """Return the camera of a shot from intrinsics or from the poses of its scene; None without both.
+    """Return the camera of a shot from ``intrinsics``, or else from the poses of its scene.
+
+    Return None if there are no intrinsics and no poses.
 
     Raises:
         PolarguideError: the intrinsics or the COLMAP model are invalid.
@@ -319,12 +330,13 @@ def camera_of(shot: ExposureSet, size: tuple[int, int], intrinsics: str | None) 
 def surface_maps(
     maps: ShotMaps, camera: Camera | None = None, refractive_index: float | None = None
 ) -> SurfaceMaps:
-    """Compute the candidates of the normals, choose one of them, and separate both lobes.
+    """Compute the candidates of the normals, choose one of them, and separate specular and diffuse light.
 
     Args:
         maps: maps of the shot.
-        camera: camera of the pixels; None assumes rays parallel to the axis, as a long lens nearly has.
-        refractive_index: refractive index of all surfaces; None: the default index.
+        camera: camera of the pixels. If None, rays are assumed to be parallel to the axis, which nearly holds for a
+            long lens.
+        refractive_index: refractive index of all surfaces. If None, the default index is used.
 
     Raises:
         PolarguideError: the refractive index is out of range.
@@ -363,10 +375,10 @@ def surface_maps(
 def _nearest_normal(
     s0: Tensor, dolp: Tensor, aolp: Tensor, rays: Tensor, index: float
 ) -> tuple[Tensor, Tensor]:
-    """Return the zeniths [3, ...] of the candidates, and the candidate nearest to ``TOWARD``.
+    """Return the zeniths [3, ...] of the candidates of the normal, and the candidate nearest to ``TOWARD``.
 
-    The result is that of ``optics.disambiguate``, but only three of the six candidates are computed. The nearer one of
-    two candidates that are half a turn apart is on the side of the prior.
+    The result equals that of ``optics.disambiguate``, but only three of the six candidates are computed. The candidates
+    form pairs that are half a turn apart. The nearer candidate of a pair is on the side of the prior.
     """
     below, above = optics.specular_zeniths(dolp, index)
     zeniths = torch.stack((optics.diffuse_zenith(dolp, index), below, above))
@@ -412,11 +424,11 @@ def array_shot(
     """Create a shot in memory. The array is not modified.
 
     Args:
-        array: with a sensor, a raw mosaic [H, W] of uint8 or uint16; else pictures through a filter, [K, H, W] gray or
-            [K, H, W, 3] RGB: uint8 or uint16 as stored, or linear floats from 0 to 1.
+        array: a raw mosaic [H, W] of uint8 or uint16 if the options name a sensor. Otherwise pictures through a filter,
+            [K, H, W] gray or [K, H, W, 3] RGB: uint8 or uint16 as stored, or linear floats from 0 to 1.
         options: options of reading.
         angles: angles of the K pictures in degrees, counter-clockwise as displayed.
-        name: name of the shot, which is the ``where`` of errors.
+        name: name of the shot, which error messages show.
 
     Raises:
         PolarguideError: shape, type or angles are invalid.
@@ -436,7 +448,7 @@ def array_shot(
         name,
         expected="integers with srgb=True",
         found=kind_of(values),
-        remedy="Leave srgb out: floats are linear.",
+        remedy="Remove srgb=True, because floats are linear.",
     )
     stored = stored_pictures(values, name)
     exposures_of(angles, len(stored), f"{name} (angles)")
@@ -454,7 +466,7 @@ def is_array(shot: object) -> TypeGuard[Array | Sequence[Array]]:
 
 
 def stacked_array(shot: Array | Sequence[Array], name: str = NAME) -> Array:
-    """Stack a list of pictures to one array; return an array unchanged.
+    """Stack a list of pictures to one array. An array is returned unchanged.
 
     Raises:
         PolarguideError: the pictures of the list differ in shape or type.
@@ -495,13 +507,13 @@ def _mosaic(values: NDArray[Any], options: ShotOptions, name: str) -> NDArray[An
         name,
         expected=f"{size[0]}x{size[1]} pixels according to width and height",
         found=f"{width}x{height}",
-        remedy="Leave the two options out: an array has a size.",
+        remedy="Remove width and height, because the array has a size of its own.",
     )
     return np.ascontiguousarray(values)
 
 
 AROUND = 32
-"""Margin of a part in samples, larger than the reach of any interpolation."""
+"""Margin in samples around a requested part of a mosaic, larger than the reach of any interpolation."""
 
 
 _GAINS = {
@@ -509,11 +521,13 @@ _GAINS = {
     "corrected": "I0 + I90 is {:+.2%} off I45 + I135; corrected.",
     "left": "I0 + I90 is {:+.2%} off I45 + I135; not corrected (--gains auto does, a calibration does better).",
 }
-"""Notes on unequal pair sums."""
+"""Notes for the user on unequal sums I0 + I90 and I45 + I135, by the setting of the gains."""
 
 
 def develop_mosaic(shot: ExposureSet, options: ShotOptions, part: Part | None) -> Developed:
-    """Develop a raw mosaic, or at least ``part`` of its picture. Levels and gains always refer to the whole mosaic.
+    """Develop a raw mosaic, or only the requested part if that saves time.
+
+    Levels and gains are always measured in the whole mosaic.
 
     Raises:
         PolarguideError: the file or an option is invalid.
@@ -581,15 +595,18 @@ def develop_mosaic(shot: ExposureSet, options: ShotOptions, part: Part | None) -
 
 
 def _cut(part: Part | None, shape: tuple[int, ...], step: int) -> tuple[slice, slice] | None:
-    """Return the samples of a mosaic that a part of its picture needs: superpixels with a margin of ``AROUND``.
+    """Return the samples of a mosaic that are needed to develop a part of its picture.
+
+    They are complete superpixels, with a margin of ``AROUND``.
 
     Args:
         part: part of the picture.
         shape: shape of the mosaic, rows and columns.
-        step: samples per pixel, each way.
+        step: samples per pixel in each direction.
 
     Returns:
-        Rows and columns; None if the part is more than half of the mosaic.
+        Slices of the rows and of the columns. None if the part is more than half of the mosaic, which is then developed
+        as a whole.
     """
     if part is None:
         return None
@@ -603,7 +620,7 @@ def _cut(part: Part | None, shape: tuple[int, ...], step: int) -> tuple[slice, s
 
 
 _MAPS = 4 * (4 * 3 + 3 + 5)
-"""Bytes per pixel of the intensities and the first maps."""
+"""Bytes per pixel that the intensities and the first maps need. They decide if a shot fits into memory."""
 
 
 def develop(shot: ExposureSet, options: ShotOptions, part: Part | None = None) -> Developed:
@@ -612,10 +629,10 @@ def develop(shot: ExposureSet, options: ShotOptions, part: Part | None = None) -
     Args:
         shot: the shot.
         options: options of reading.
-        part: part of the picture of a mosaic that is needed; None: all of it.
+        part: requested part of the picture of a mosaic. If None, the whole picture is developed.
 
     Raises:
-        PolarguideError: a file is missing, cannot be read, or does not fit the others or the options.
+        PolarguideError: a file is missing or cannot be read, or the files do not fit each other or the options.
     """
     if shot.kind == "mosaic":
         try:
@@ -645,10 +662,12 @@ def develop(shot: ExposureSet, options: ShotOptions, part: Part | None = None) -
 
 
 def set_samples(shot: ExposureSet, options: ShotOptions) -> SetSamples | None:
-    """Read the samples of a shot at any polarizer angles; None for four angles or a mosaic, which ``develop`` reads.
+    """Read the samples of a shot at any polarizer angles.
+
+    Return None for four usual angles or a mosaic, which ``develop`` reads.
 
     Raises:
-        PolarguideError: a file is missing, cannot be read, or does not fit the others or the options.
+        PolarguideError: a file is missing or cannot be read, or the files do not fit each other or the options.
     """
     if shot.kind == "set" and shot.stored is not None:
         return samples_of_arrays(shot.name, shot.stored, shot.angles, options)
@@ -661,10 +680,10 @@ def set_samples(shot: ExposureSet, options: ShotOptions) -> SetSamples | None:
 
 
 def check_files(options: ShotOptions) -> None:
-    """Validate the dark frame and the calibration before the first of many shots.
+    """Validate the dark frame and the calibration once, before the first of many shots is read.
 
     Raises:
-        PolarguideError: a file is missing, or the calibration is damaged or of another sensor.
+        PolarguideError: a file is missing, or the calibration is damaged or belongs to a different sensor.
     """
     if options.dark_frame is not None:
         require_file(options.dark_frame, expected="a dark frame", remedy="Check --dark-frame.")
@@ -692,7 +711,7 @@ def _filter(shot: ExposureSet, options: ShotOptions) -> Developed:
     """Develop four shots through a filter.
 
     Raises:
-        PolarguideError: a file is missing, cannot be read, or does not fit the others or the options.
+        PolarguideError: a file is missing or cannot be read, or the files do not fit each other or the options.
     """
     if shot.stored is None:
         require_four_shots(shot.paths[0].parent, {shot.name: shot.files})
@@ -742,7 +761,11 @@ def _filter(shot: ExposureSet, options: ShotOptions) -> Developed:
 
 
 def _read_view(shot: ExposureSet, options: ShotOptions) -> tuple[ViewData, int | None]:
-    """Read a view of a scene, and return it with the stored value at which it saturates, or None."""
+    """Read a view of a scene.
+
+    Returns:
+        The view; and the stored value at which it saturates, or None if the scene does not state this value.
+    """
     assert shot.root is not None
     layout = find_layout(shot.root)
     select_views(layout, [shot.view])
@@ -765,13 +788,15 @@ def _undistorted(
     lsb: float,
     options: ShotOptions,
 ) -> Developed:
-    """Return the intensities of a view, whose samples are its pixels.
+    """Return the developed intensities of a view of a scene, whose pixels are already complete samples.
 
     Args:
         intensities: [4, H, W, C].
-        dark, saturated, invalid: masks [H, W].
-        foreground: mask [H, W] of the view, or None.
-        lsb: one stored value as a share of full scale.
+        dark: mask [H, W] of dark pixels.
+        saturated: mask [H, W] of saturated pixels.
+        invalid: mask [H, W] of invalid pixels.
+        foreground: mask [H, W] of the object in the view, or None.
+        lsb: step between two stored values, as a share of full scale.
         options: options of reading.
     """
     gray = intensities.mean(axis=3)

@@ -1,4 +1,4 @@
-"""Printable scale of polarizer angles around the ring of a filter."""
+"""Printable scale with the angles of a polarizing filter, to put around its ring."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ BAND = 16.0
 MARGIN = 6.0
 """Margin around the ring in mm."""
 LABELED = 15
-"""Degrees between numbers."""
+"""Degrees between two numbers on the scale."""
 SHORT = 5
-"""Degrees between lines."""
+"""Degrees between two lines on the scale."""
 RULER = 50.0
-"""Length of the ruler in mm."""
+"""Length in mm of the printed ruler, which shows if the print has the right size."""
 _FOOT = 22.0
 _SLIT = 277.5
 
@@ -23,11 +23,12 @@ _SLIT = 277.5
 def ring_scale(diameter: float) -> str:
     """Return an SVG picture of a paper ring with the angles of a filter, in millimeters.
 
-    Seen from behind the camera, angles count counter-clockwise from its horizontal. The scale is read from the front,
-    where they count clockwise from the left. The period is 180 degrees, so each angle is on the ring twice.
+    Seen from behind the camera, angles count counter-clockwise from the camera's horizontal. The scale is read from the
+    front, where the angles count clockwise from the left. The period is 180 degrees, so each angle is on the ring
+    twice.
 
     Args:
-        diameter: diameter of the hole, the outer diameter of the filter's rotating ring, in mm.
+        diameter: diameter of the hole in mm, which is the outer diameter of the filter's rotating ring.
     """
     inner = diameter / 2
     outer = inner + BAND
@@ -65,6 +66,9 @@ def ring_scale(diameter: float) -> str:
 
 
 def place(degrees: float, middle: float, radius: float) -> tuple[float, float]:
-    """Return the position of an angle on the print, x right, y down: 0 at the left, 90 at the top, clockwise."""
+    """Return the position (x right, y down) of an angle on the print.
+
+    0 degrees is at the left, 90 degrees at the top, and angles increase clockwise.
+    """
     turn = math.radians(degrees)
     return middle - radius * math.cos(turn), middle - radius * math.sin(turn)

@@ -1,4 +1,4 @@
-"""Samples of a set for the fit: linear values of its pictures, their angles and exposures."""
+"""Prepare the pictures of a set for the fit: linear samples, with the angle and exposure of each picture."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ from polarguide_shots.options import ShotOptions
 from polarguide_shots.sets import SetPicture, known_indices, read_frames
 
 _COMPRESSED_FULL = 250
-"""Full scale of compressed video. Compression smears the edge of clipped areas over a few values."""
+"""Stored value that counts as full scale in compressed video, which blurs the edge of clipped areas."""
 _FITTED = 4 * (4 * 3 + 3 + 7)
-"""Bytes per pixel of the fit: intensities, Stokes vectors and maps."""
+"""Bytes per pixel that the fit needs for intensities, Stokes vectors and maps."""
 
 
 def read_set(name: str, pictures: Sequence[SetPicture], options: ShotOptions) -> SetSamples:
@@ -70,7 +70,7 @@ def samples_of_arrays(
 
     Args:
         name: name of the shot.
-        stored: [K, H, W, 3] uint8 or uint16.
+        stored: stored values [K, H, W, 3] of uint8 or uint16.
         angles: angles of the K pictures.
         options: options of the shot.
     """
@@ -88,7 +88,7 @@ def samples_of_arrays(
 
 
 def _stack(name: str, where: Path, count: int, pictures: Iterator[Shots]) -> tuple[Shots, np.dtype[Any]]:
-    """Stack pictures to one array of uint16, with one channel if all pictures are gray.
+    """Stack pictures to one array of uint16. The array has one channel if all pictures are gray.
 
     Args:
         name: name of the set.
@@ -97,7 +97,7 @@ def _stack(name: str, where: Path, count: int, pictures: Iterator[Shots]) -> tup
         pictures: iterator of the pictures.
 
     Returns:
-        The stack, and the stored type of the pictures.
+        The stacked pictures; and the type of their stored values.
 
     Raises:
         PolarguideError: memory is too small for the pictures and their fit.
@@ -135,7 +135,7 @@ def _samples(
     files: Sequence[Path],
     options: ShotOptions,
 ) -> SetSamples:
-    """Linearize stored samples in place, and rotate them upright.
+    """Convert stored values to linear samples in place, and rotate the pictures upright.
 
     Args:
         stack: result of ``_stack``.
@@ -188,13 +188,15 @@ def _samples(
 
 
 def _subset(read: Shots, codes: NDArray[Any]) -> Shots:
-    """Return some pixels of the pictures, with ``codes`` in place of the stored values."""
+    """Return pictures that contain only some pixels. ``codes`` are the stored values of these pixels."""
     usable = checks.sampled(~(read.clipped.any(axis=0) | read.dark)[None])
     return Shots(codes[checks.sampled(read.pictures)], 1, ~usable, np.zeros(usable.shape[1:], bool))
 
 
 def require_no_order(calibration: Calibration, name: str) -> None:
-    """Check that a calibration has no gains and no order, which apply to 0, 45, 90 and 135 degrees only.
+    """Check that a calibration has no gains and no order of the angles.
+
+    Gains and order apply to pictures at 0, 45, 90 and 135 degrees only.
 
     Raises:
         PolarguideError: the calibration has gains or an order.
@@ -203,17 +205,17 @@ def require_no_order(calibration: Calibration, name: str) -> None:
         require(
             not given,
             f"calibration ({field})",
-            expected="pictures at 0, 45, 90 and 135 degrees, which the option applies to",
+            expected="pictures at 0, 45, 90 and 135 degrees, to which gains and order apply",
             found=f"{name}, a set of pictures at other angles",
-            remedy="Leave it out; sense and zero apply, and angles.csv has a column gain.",
+            remedy="Remove gains and order; sense and zero apply. List gains in the column gain of angles.csv.",
         )
 
 
 def _read_each(pictures: Sequence[SetPicture]) -> Iterator[Shots]:
-    """Read pictures of one size, depth and orientation.
+    """Read pictures one after the other, and check that size, depth and orientation agree.
 
     Raises:
-        PolarguideError: a picture cannot be read, or differs from the first one.
+        PolarguideError: a picture cannot be read, or differs from the first picture.
     """
     first: Shots | None = None
     for path, group in itertools.groupby(pictures, key=lambda picture: picture.path):
@@ -242,7 +244,10 @@ def _video(path: Path, frames: Sequence[int | None]) -> Iterator[Shots]:
 
 
 def _gains(pictures: Sequence[SetPicture]) -> tuple[list[float], list[str]]:
-    """Return the gain of each picture, from the table or else from the exposures in the files, and notes."""
+    """Return the gain of each picture, and notes for the user.
+
+    Gains come from the table, or else from the exposures that the files state.
+    """
     gains = [picture.gain for picture in pictures]
     if all(gain is None and picture.frame is None for gain, picture in zip(gains, pictures, strict=True)):
         return stated_of_shot([picture.path for picture in pictures])
@@ -250,11 +255,11 @@ def _gains(pictures: Sequence[SetPicture]) -> tuple[list[float], list[str]]:
 
 
 def samples_of_view(data: ViewData, full: int | None, options: ShotOptions) -> SetSamples:
-    """Return the samples of a view of a scene folder at other angles than the usual four.
+    """Return the samples of a view of a scene folder whose angles are not the usual four.
 
     Args:
         data: the view.
-        full: stored value at which it saturates, or None.
+        full: stored value at which the view saturates, or None.
         options: options of the shot.
 
     Raises:
@@ -279,7 +284,7 @@ def samples_of_view(data: ViewData, full: int | None, options: ShotOptions) -> S
 
 
 def behind_lens(view: View, intensities: Tensor, exposures: Sequence[Exposure]) -> Tensor:
-    """Convert intensities of a view [K, H, W, C] to those of polarizers behind the lens."""
+    """Convert intensities [K, H, W, C] of a view to the values that polarizers behind the lens would give."""
     if view.mount == "sensor":
         return intensities
     rays = view.camera.rays()
@@ -288,7 +293,10 @@ def behind_lens(view: View, intensities: Tensor, exposures: Sequence[Exposure]) 
 
 
 def state_of(view: View) -> tuple[Mask, Mask, float]:
-    """Return masks of dark and saturated pixels of a view, and one stored value as a share of full scale."""
+    """Return three values of a view: a mask of dark pixels, a mask of saturated pixels, and the stored step.
+
+    The step is the difference between two successive stored values, as a share of full scale.
+    """
     codes = view.codes.numpy()
     peak = codes.max(axis=(0, 3))
     lost = view.saturated.numpy()
@@ -300,7 +308,9 @@ def state_of(view: View) -> tuple[Mask, Mask, float]:
 
 
 def samples_of_loaded(view: View) -> SetSamples:
-    """Return the samples of a loaded view, with its mask and exposures, corrected for a filter before the lens.
+    """Return the samples of a loaded view, including its mask and exposures.
+
+    A filter before the lens is corrected.
 
     Raises:
         PolarguideError: the pictures at known angles do not determine Stokes vectors.
@@ -323,12 +333,15 @@ def samples_of_loaded(view: View) -> SetSamples:
 
 
 def _unused(count: int) -> tuple[str, ...]:
-    """Return a note on the number of pictures at unknown angles."""
+    """Return a note for the user on the number of pictures that are not used because their angles are unknown."""
     return (f"{count} pictures without a known angle are not used.",) if count else ()
 
 
 def stated_of_shot(paths: Sequence[Path]) -> tuple[list[float], list[str]]:
-    """Return the relative exposures that the files of a shot state, else ones, and notes for the user."""
+    """Return the relative exposures that the files of a shot state, and notes for the user.
+
+    All exposures are 1 if a file states no exposure.
+    """
     stated, missing = stated_exposures({"": paths})
     if not stated:
         return [1.0] * len(paths), [missing] if missing else []

@@ -1,4 +1,4 @@
-"""Exposure sets, and the search for sets at any polarizer angles by names, folders, a table, or frames of a video."""
+"""Find sets of pictures at any polarizer angles, by file names, folders, a table, or the frames of a video."""
 
 from __future__ import annotations
 
@@ -46,14 +46,14 @@ from polarguide_shots.options import Kind
 
 @dataclass(frozen=True)
 class SetPicture:
-    """A picture of a set.
+    """One picture of a set.
 
     Attributes:
         path: path of the picture, or of the video.
-        angle: angle of the polarizer in degrees as the user counts it; "unknown", or "none" without a polarizer. Only
-            pictures at known angles are used.
+        angle: angle of the polarizer in degrees, in the user's direction of counting. "unknown" if it is unknown,
+            "none" if there was no polarizer. Only pictures at known angles are used.
         gain: exposure relative to the other pictures if a table states it, else None.
-        frame: frame of the video, counted from 0; None for a picture file.
+        frame: number of the frame in a video, counted from 0. None for a picture file.
     """
 
     path: Path
@@ -63,7 +63,7 @@ class SetPicture:
 
     @property
     def label(self) -> str:
-        """Name in messages."""
+        """Name of the picture in messages."""
         return self.path.name if self.frame is None else f"{self.path.name} frame {self.frame}"
 
 
@@ -73,18 +73,19 @@ class ExposureSet:
 
     Attributes:
         name: name that is unique among the sets of one search and valid in a file name.
-        kind: mosaic (one file), filter (one file each at 0, 45, 90 and 135 degrees), set (pictures at any angles) or
-            scene (a view of a scene folder).
-        files: files by angle; the file of a mosaic at 0; empty for a set. ``read_shot`` reports missing angles.
+        kind: "mosaic" is one raw file. "filter" has one file each at 0, 45, 90 and 135 degrees. "set" has pictures at
+            any angles. "scene" is a view of a scene folder.
+        files: files by angle. The file of a mosaic has the key 0. The dictionary is empty for a set. ``read_shot``
+            reports missing angles.
         root: folder of the scene, else None.
         view: name of the view in the scene.
-        fault: error of an invalid shot, which ``read_shot`` raises. Other shots of the search are not affected.
-        others: files of an invalid shot that are not in ``files``, or its folder; the pictures of a view of a scene at
-            other angles than the usual four.
+        fault: error of an invalid shot, which ``read_shot`` raises. The remaining shots of the search are not affected.
+        others: files of an invalid shot that are not in ``files``, or its folder. For a view of a scene, the pictures
+            at unusual angles.
         pictures: pictures of a set, by angle.
-        table: table with their angles; None if names state the angles.
-        stored: pictures of a shot in memory: [H, W] of a mosaic, else [K, H, W, 3].
-        angles: angles of the pictures in memory, as the user counts them; empty for a mosaic.
+        table: table with the angles of the pictures. None if names state the angles.
+        stored: pictures of a shot in memory: [H, W] for a mosaic, else [K, H, W, 3].
+        angles: angles of the pictures in memory, in the user's direction of counting. Empty for a mosaic.
     """
 
     name: str
@@ -101,33 +102,33 @@ class ExposureSet:
 
     @property
     def paths(self) -> tuple[Path, ...]:
-        """Files by angle and the table of a set; empty for a shot in memory."""
+        """All files of the shot: pictures by angle, then the table of a set. Empty for a shot in memory."""
         pictures = dict.fromkeys(picture.path for picture in self.pictures)
         table = [] if self.table is None else [self.table]
         return (*(path for _, path in sorted(self.files.items())), *pictures, *table, *self.others)
 
     @property
     def where(self) -> Path | str:
-        """The first file, or the name, for messages."""
+        """First file of the shot, or its name, for messages."""
         return self.paths[0] if self.paths else self.name
 
     @property
     def complete(self) -> bool:
-        """True if a table lists the pictures of a set, or they cover half a turn evenly."""
+        """True if all pictures of a set have arrived: a table lists them, or their angles cover half a turn evenly."""
         angles = [picture.angle for picture in self.pictures if not isinstance(picture.angle, str)]
         return self.table is not None or covers_turn([angle % 180 for angle in angles])
 
     @property
     def empty(self) -> bool:
-        """True for a fault without a shot."""
+        """True if the set consists only of an error, without a picture."""
         return self.fault is not None and not (self.files or self.pictures)
 
 
 def require_determined(where: object, angles: Sequence[Angle]) -> None:
-    """Check that angles determine a Stokes vector well.
+    """Check that pictures at some angles determine a Stokes vector well.
 
     Raises:
-        PolarguideError: fewer than three known angles differ modulo 180 degrees, or all are too similar.
+        PolarguideError: fewer than three known angles differ modulo 180 degrees, or all angles are too similar.
     """
     texts = listed([angle_text(angle) for angle in angles], 12)
     exposures = [Exposure(normalized(angle)) for angle in angles if not isinstance(angle, str)]
@@ -150,7 +151,7 @@ def require_determined(where: object, angles: Sequence[Angle]) -> None:
 
 
 def known_indices(view: str, exposures: Sequence[Exposure]) -> list[int]:
-    """Return the indices of the pictures of a view at known angles.
+    """Return the indices of the pictures of a view whose angles are known.
 
     Raises:
         PolarguideError: the angles do not determine Stokes vectors.
@@ -168,9 +169,10 @@ def _exposure_set(
     table: Path | None = None,
     fault: PolarguideError | None = None,
 ) -> ExposureSet:
-    """Create a set with its pictures in order, and with a fault if its angles do not determine Stokes vectors.
+    """Create a set from pictures, which are sorted by angle.
 
-    One picture each at 0, 45, 90 and 135 degrees, without gains, are a shot of kind "filter".
+    The set has a fault if its angles do not determine Stokes vectors. Its kind is "filter" if it has exactly one
+    picture at each of 0, 45, 90 and 135 degrees, and no gains.
     """
     ordered = tuple(sorted(pictures, key=lambda p: (*angle_order(p.angle), p.path.name, p.frame or 0)))
     if fault is None:
@@ -187,10 +189,10 @@ def _exposure_set(
 def by_name(files: Sequence[Path]) -> tuple[list[ExposureSet], list[Path]]:
     """Find sets by the names of files.
 
-    Files whose names are angles only are one set with the name of their folder if the folder has no other files.
+    If the names of all files in a folder are only angles, the files form one set with the name of the folder.
 
     Returns:
-        The sets, and the remaining files: files of four angles at most, and files without an angle in the name.
+        The sets; and the remaining files. The remaining files have the four usual angles, or no angle in their names.
     """
     sets: list[ExposureSet] = []
     rest: list[Path] = []
@@ -214,7 +216,10 @@ def by_name(files: Sequence[Path]) -> tuple[list[ExposureSet], list[Path]]:
 
 
 def by_folder(root: Path) -> list[ExposureSet]:
-    """Find sets by folders named like angles, with a file of each view; empty for four angles at most."""
+    """Find sets in folders whose names are angles, each with one file of each view.
+
+    Return an empty list if all folders have one of the four usual angles.
+    """
     views: dict[str, list[SetPicture]] = {}
     for folder, angle in folders_of_angles(root).items():
         for path in list_files(folder, SHOT_SUFFIXES):
@@ -225,7 +230,7 @@ def by_folder(root: Path) -> list[ExposureSet]:
 
 
 def _named_set(folder: Path, view: str, pictures: Sequence[SetPicture]) -> ExposureSet:
-    """Create a set whose names state the angles. Two files with one angle are a fault."""
+    """Create a set whose file names state the angles. The set has a fault if two files have the same angle."""
     first: dict[Angle, Path] = {}
     for picture in pictures:
         earlier = first.setdefault(picture.angle, picture.path)
@@ -246,11 +251,12 @@ def _named_set(folder: Path, view: str, pictures: Sequence[SetPicture]) -> Expos
 def by_table(root: Path) -> tuple[list[ExposureSet], list[Path]]:
     """Read the sets in the table ``angles.csv`` of a folder.
 
-    Lines with one view are a set. Lines without a view are sets by the names of their files if all of these names
-    contain a view, else one set with the name of the folder. Repeated angles are valid.
+    Lines with the same view form one set. Lines without a view are grouped by the views in their file names. If a file
+    name contains no view, all lines without a view form one set with the name of the folder. An angle may occur several
+    times.
 
     Returns:
-        The sets, and the pictures of the folder that are not in the table.
+        The sets; and the pictures of the folder that are not in the table.
 
     Raises:
         PolarguideError: the table cannot be read, or lists files outside of the folder or of other types.
@@ -272,7 +278,7 @@ def by_table(root: Path) -> tuple[list[ExposureSet], list[Path]]:
 
 
 def _table_set(table: Path, view: str, pictures: Sequence[SetPicture]) -> ExposureSet:
-    """Create the set of a view's pictures. A missing file is a fault."""
+    """Create the set of the pictures of one view in a table. The set has a fault if a file is missing."""
     existing = [picture for picture in pictures if picture.path.is_file()]
     missing = [picture.path for picture in pictures if picture not in existing]
     if not missing:
@@ -287,7 +293,7 @@ def _table_set(table: Path, view: str, pictures: Sequence[SetPicture]) -> Exposu
 
 
 def videos(files: Sequence[Path]) -> list[ExposureSet]:
-    """Create a set of each video among files, with the frames in the table next to it."""
+    """Create a set for each video among some files. The table next to the video lists the frames."""
     sets = []
     for path in (path for path in files if path.suffix.lower() in VIDEO_SUFFIXES):
         table = path.with_suffix(".csv")
@@ -305,10 +311,10 @@ _REMEDY = "Write a line for each frame to use: its number, counted from 0, and i
 
 
 def read_frame_table(path: Path, video: Path) -> list[tuple[int, Angle]]:
-    """Read a table ``frame,angle`` of a video.
+    """Read the table of a video, which has the columns ``frame,angle``.
 
     Returns:
-        Frames, counted from 0, and their angles.
+        Pairs of a frame, counted from 0, and its angle.
 
     Raises:
         PolarguideError: the table is missing, a cell is invalid, or a frame is repeated.
@@ -316,7 +322,7 @@ def read_frame_table(path: Path, video: Path) -> list[tuple[int, Angle]]:
     require(
         path.is_file(),
         path,
-        expected=f"a table frame,angle of {video.name}",
+        expected=f"a table with the columns frame,angle for {video.name}",
         found="no such file",
         remedy=_REMEDY,
     )
@@ -325,7 +331,7 @@ def read_frame_table(path: Path, video: Path) -> list[tuple[int, Angle]]:
     require(
         header == "frame,angle",
         f"{path} (line 1)",
-        expected="the header frame,angle",
+        expected='the header "frame,angle"',
         found=shortened(header) if header else "an empty file",
         remedy=_REMEDY,
     )
@@ -336,7 +342,7 @@ def read_frame_table(path: Path, video: Path) -> list[tuple[int, Angle]]:
         if angle is None or frame is None or frame in frames:
             raise PolarguideError(
                 f"{path} (line {number})",
-                expected=f"a frame that is not in another line, and its angle up to {LARGEST:g} degrees",
+                expected=f"a frame number that occurs only once, and an angle of at most {LARGEST:g} degrees",
                 found=shortened(",".join(row)),
                 remedy=_REMEDY,
             )
@@ -347,7 +353,7 @@ def read_frame_table(path: Path, video: Path) -> list[tuple[int, Angle]]:
 def read_frames(path: Path, frames: Sequence[int]) -> Iterator[NDArray[np.uint8]]:
     """Read frames of a video [H, W, 3] uint8 RGB, one after the other.
 
-    Frames keep their stored orientation: angles count from their horizontal.
+    Frames keep their stored orientation, because angles are counted from the horizontal of the stored frame.
 
     Args:
         path: path of the video.

@@ -1,4 +1,4 @@
-"""The verbs measure, priors, calibrate and scale."""
+"""Commands ``measure``, ``priors``, ``calibrate`` and ``scale``."""
 
 from __future__ import annotations
 
@@ -59,8 +59,8 @@ def measure(
             watching.watch is not None or getattr(watching, name) == getattr(WatchOptions, name),
             f"--{name}",
             expected="--watch",
-            found="one pass over files",
-            remedy="Leave it out, or watch a folder.",
+            found="no --watch",
+            remedy="Remove the option, or watch a folder.",
         )
     reading = replace(reading, calibration=angles.read(), analyzers=angles.analyzers())
     heard = partial(_print_entry, every=watching.watch is not None)
@@ -90,7 +90,7 @@ def measure(
 
 
 def _print_entry(entry: Any, *, every: bool) -> None:
-    """Print a shot that is beyond a limit or could not be read; with ``every``, any shot."""
+    """Print a shot that exceeds a limit or could not be read. If ``every`` is True, print all shots."""
     if entry.status == "unread":
         print_error(entry.why)
     elif entry.status == "beyond":
@@ -211,13 +211,13 @@ def run_priors(
 
 
 def _refuse(expected: str, found: str, **options: object) -> None:
-    """Check that options are not given which apply to ``expected`` only.
+    """Check that options are not used which apply only to ``expected``.
 
     Raises:
-        PolarguideError: an option is given.
+        PolarguideError: the user specified one of the options.
     """
     for name, value in options.items():
-        remedy = f"Leave it out, or name {expected}."
+        remedy = f"Remove the option, or specify {expected}."
         require(value is None, option_name(name), expected=expected, found=found, remedy=remedy)
 
 

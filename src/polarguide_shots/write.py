@@ -1,4 +1,4 @@
-"""Files of the maps of shots: PNG with legends, EXR and NPY with numbers, and a self-contained page."""
+"""Write the maps of shots: PNG files with legends, EXR and NPY files with numbers, and a self-contained page."""
 
 from __future__ import annotations
 
@@ -41,18 +41,18 @@ from polarguide_shots.read import (
 from polarguide_shots.sets import ExposureSet
 
 FORMATS = ("png", "exr", "npy", "page")
-"""Formats of maps."""
+"""Names of the file formats in which maps can be written."""
 UNITS_FILE = "maps.json"
-"""Name of the file with the units of maps."""
+"""Name of the file that lists the unit of each map."""
 
 
 @dataclass(frozen=True)
 class WrittenShots:
-    """Results of several shots.
+    """Result of ``write_shots``: the folders that were written, and the shots that failed.
 
     Attributes:
         folders: folders of the written shots, by name.
-        faults: errors of the other shots, by name.
+        faults: errors of the shots that failed, by name.
     """
 
     folders: dict[str, Path]
@@ -69,22 +69,25 @@ def write_shots(
     refractive_index: float | None = None,
     reporter: Reporter = SILENT,
 ) -> WrittenShots:
-    """Write all maps of one or many shots, a folder for each.
+    """Write all maps of one or many shots, each shot in its own folder.
 
-    A shot that cannot be read or written does not stop the others. Files of an earlier call in other formats are
-    removed.
+    If a shot cannot be read or written, the remaining shots are still written. Files of an earlier call in other
+    formats are removed.
 
     Args:
         paths: files and folders for ``find_shots``, or its results.
         out: folder to write, with a folder for each shot.
         options: options of reading.
-        formats: png (with legends), exr and npy (numbers with units in ``maps.json``), page.
-        intrinsics: ``fx,fy,cx,cy`` of the developed pictures; None: the poses of a scene, else parallel rays.
-        refractive_index: refractive index of all surfaces; None: the default of ``surface_maps``.
+        formats: names from ``FORMATS``: png (pictures with legends), exr and npy (numbers, with units in
+            ``maps.json``), page (HTML).
+        intrinsics: ``fx,fy,cx,cy`` of the developed pictures. If None, the poses of a scene are used. Without poses,
+            rays are assumed to be parallel.
+        refractive_index: refractive index of all surfaces. If None, the default of ``surface_maps`` is used.
         reporter: receiver of messages and progress.
 
     Raises:
-        PolarguideError: there are no shots, an option is invalid, or all shots failed (the error of the first shot).
+        PolarguideError: there are no shots, or an option is invalid. If all shots failed, the error of the first shot
+            is raised.
     """
     options = (options or ShotOptions()).checked()
     check_formats(formats)
@@ -133,13 +136,15 @@ def write_view_maps(
     refractive_index: float | None = None,
     reporter: Reporter = SILENT,
 ) -> dict[str, Path]:
-    """Write all maps of views of a scene, a folder for each, and return the folders by name.
+    """Write all maps of views of a scene, each view in its own folder, and return the folders by name.
 
     Args:
         views: views whose pictures determine Stokes vectors.
+        out: folder to write, as in ``write_shots``.
+        options: options of reading. Only ``full_well``, ``read_noise`` and ``snr`` apply.
         formats: formats that ``check_formats`` has accepted.
-        out, options, refractive_index, reporter: see ``write_shots``. Only the options ``full_well``, ``read_noise``
-            and ``snr`` apply.
+        refractive_index: refractive index of all surfaces, as in ``write_shots``.
+        reporter: receiver of messages and progress.
 
     Raises:
         PolarguideError: the pictures of a view do not determine Stokes vectors, or an option is invalid.
@@ -156,10 +161,10 @@ def write_view_maps(
 
 
 def check_formats(formats: Collection[str]) -> None:
-    """Validate the names of formats of maps.
+    """Validate the names of file formats of maps.
 
     Raises:
-        PolarguideError: there are no formats, a format is unknown, or its package is missing.
+        PolarguideError: there are no formats, a format is unknown, or the package that writes it is missing.
     """
     unknown = sorted(set(formats) - set(FORMATS))
     require(
@@ -179,7 +184,8 @@ def write_maps(
     """Write the maps of one shot into a folder, and remove maps of an earlier call in other formats.
 
     Args:
-        maps, surface: maps of the shot.
+        maps: polarization maps of the shot.
+        surface: normals and layers of the shot.
         folder: folder to write.
         formats: formats of the files.
 
@@ -215,13 +221,13 @@ def write_maps(
 
 
 def _files_of(formats: Collection[str], kinds: Sequence[MapKind]) -> list[str]:
-    """Return the names of the files of formats."""
+    """Return the names of the files that are written for some formats and kinds of maps."""
     names = [f"{kind.key}.{suffix}" for suffix in formats if suffix != "page" for kind in kinds]
     return [*names, PAGE] if "page" in formats else names
 
 
 def _shares(maps: ShotMaps) -> dict[str, float]:
-    """Return the share of the pixels with each reason, by name."""
+    """Return the share of the pixels that have each ``Reason``, by its name."""
     shares = np.bincount(maps.reason.ravel(), minlength=len(Reason)) / maps.reason.size
     return {code.name.lower(): float(shares[code]) for code in Reason}
 
@@ -245,7 +251,9 @@ def _record(maps: ShotMaps, surface: SurfaceMaps) -> dict[str, Any]:
 
 
 def _write_exr(path: Path, values: NDArray[Any], unit: str, note: str) -> None:
-    """Write one map as 32-bit floats with its unit in the header, as channel Y, or R, G, B (x, y, z of a normal).
+    """Write one map as 32-bit floats, with its unit in the header.
+
+    A map of one component is channel Y. A map of three components is R, G, B, which are x, y, z for a normal.
 
     Raises:
         OSError: the file cannot be written.
@@ -262,11 +270,11 @@ def _write_exr(path: Path, values: NDArray[Any], unit: str, note: str) -> None:
 
 
 PAGE = "shot.html"
-"""Name of the page."""
+"""Name of the HTML file of a shot."""
 SIDE = 816
-"""Longest side of the pictures on the page in pixels, a third of a sensor."""
+"""Largest width or height of the pictures on the page in pixels, a third of a sensor."""
 _HIDDEN = ("zenith_diffuse", "zenith_specular_below", "zenith_specular_above")
-"""Maps that are on the page as numbers only."""
+"""Maps whose values are in the page, but which are not shown as pictures."""
 _SMALLEST_SIGMA = 1e-6
 _LARGEST_SIGMA = 10.0
 _PACKAGE = "polarguide_shots"
@@ -275,8 +283,8 @@ _PACKAGE = "polarguide_shots"
 def shot_page(maps: ShotMaps, surface: SurfaceMaps) -> str:
     """Create the HTML page of a shot. All names and texts are escaped.
 
-    Pictures and numbers are samples of every k-th pixel each way without averaging. The longer side has at most
-    ``SIDE`` samples.
+    To limit its size, the page contains every k-th pixel of each row and column without averaging. The longer side has
+    at most ``SIDE`` pixels.
     """
     step = max(1, math.ceil(max(maps.size) / SIDE))
     layers = []
@@ -310,7 +318,11 @@ def shot_page(maps: ShotMaps, surface: SurfaceMaps) -> str:
 
 
 def _numbers(maps: ShotMaps, surface: SurfaceMaps, step: int) -> tuple[str, dict[str, float]]:
-    """Encode the numbers of the page: planes of bytes, deflated and in base64, and their scales."""
+    """Encode the values of the maps for the page.
+
+    Returns:
+        The values as bytes, compressed and in base64; and the scales that convert them to numbers.
+    """
     at = np.s_[::step, ::step]
 
     def split(share: NDArray[Any]) -> list[NDArray[np.uint8]]:
@@ -340,7 +352,7 @@ def _numbers(maps: ShotMaps, surface: SurfaceMaps, step: int) -> tuple[str, dict
 
 
 def _facts(maps: ShotMaps, surface: SurfaceMaps) -> dict[str, str]:
-    """Return the facts of a shot for the page, by label."""
+    """Return the properties of a shot that the page lists, by label."""
     ratio = "too dark" if maps.pair_ratio is None else f"{maps.pair_ratio:.4f} (1 for ideal polarizers)"
     wells = f", {1 / maps.noise.slope:,.0f} electrons at full scale" if maps.noise.slope > 0 else ""
     return {
@@ -358,7 +370,7 @@ def _facts(maps: ShotMaps, surface: SurfaceMaps) -> dict[str, str]:
 
 
 def _facts_of_set(maps: ShotMaps) -> dict[str, str]:
-    """Return the stated and apparent angles of the pictures of a set, and their residuals."""
+    """Return the properties of a set at any angles: its angles as stated and as estimated, and its residuals."""
     rows = [
         f"{fit.label}: {fit.angle:g}°"
         + (f", looks like {fit.looks_like:.1f}°" if fit.looks_like is not None else "")
@@ -377,16 +389,16 @@ _OF_S0 = "linear radiance in units of S0 (2 is full scale of all four intensitie
 
 @dataclass(frozen=True)
 class MapKind:
-    """A kind of map of a shot, such as the DoLP, with its values, unit and colors.
+    """Description of a kind of map, such as the DoLP: its values, its unit, and its colors in pictures.
 
     Attributes:
         key: name in file names.
         label: name in pictures and pages.
         unit: unit of the values in files.
-        look: type of drawing.
+        look: type of picture, which selects how values become colors.
         values: function that computes the map.
         color_map: color map of a scalar.
-        fixed: range of the colors; None: a range that fits each map.
+        fixed: lowest and highest value of the colors. If None, the range is chosen for each map.
         factor: factor from ``unit`` to ``shown_unit``.
         shown_unit: unit in the picture.
         note: limitation, for the legend.
@@ -437,7 +449,7 @@ KINDS: tuple[MapKind, ...] = (
     MapKind("reason", "usable pixels", "0 usable, 1 noise, 2 dark, 3 saturated, 4 masked", "reason",
             lambda m, s: m.reason),
 )  # fmt: skip
-"""Maps of every shot, in the order of the page."""
+"""Kinds of maps that every shot has, in the order of the page."""
 ALL_KINDS: tuple[MapKind, ...] = (
     *KINDS,
     MapKind("residual", "residual", "standard deviations of the noise", "scalar", lambda m, s: np.asarray(m.residual),
@@ -446,11 +458,11 @@ ALL_KINDS: tuple[MapKind, ...] = (
     MapKind("left_out", "samples left out", "samples", "scalar", lambda m, s: np.asarray(m.left_out), "viridis",
             note="at full scale, or against the other pictures of the set"),
 )  # fmt: skip
-"""Maps of all shots, including the maps of sets at other angles."""
+"""All kinds of maps, including those that only sets at any angles have."""
 
 
 def kinds_of(maps: ShotMaps) -> tuple[MapKind, ...]:
-    """Return the kinds of maps of a shot. ``residual`` and ``left_out`` are optional."""
+    """Return the kinds of maps that a shot has. ``residual`` and ``left_out`` are optional."""
     return tuple(kind for kind in ALL_KINDS if getattr(maps, kind.key, kind) is not None)
 
 
@@ -461,7 +473,7 @@ REASON_COLORS: dict[Reason, tuple[int, int, int]] = {
     Reason.SATURATED: (230, 60, 50),
     Reason.MASKED: (245, 190, 60),
 }
-"""Colors of the reasons."""
+"""Color of each reason in the map of usable pixels."""
 NOTHING = (96, 100, 110)
 """Color of pixels without a measurement."""
 _ROUND = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0)
@@ -471,10 +483,11 @@ _NARROWEST = 640
 
 @dataclass(frozen=True)
 class Stretch:
-    """Range of the colors of a map.
+    """Range of values that the colors of a picture cover.
 
     Attributes:
-        low, high: numbers at both ends, in the unit of the picture; a radiance is divided by ``high``.
+        low: number at the lower end, in the unit of the picture.
+        high: number at the upper end, in the unit of the picture. A radiance is divided by it.
         text: description of the range.
     """
 
@@ -484,7 +497,7 @@ class Stretch:
 
 
 def stretch_of(kind: MapKind, values: NDArray[Any], maps: ShotMaps) -> Stretch:
-    """Choose a range that contains nearly all measured numbers of a map. Layers share the range of S0."""
+    """Choose a range that contains nearly all measured values of a map. Layers share the range of S0."""
     if kind.fixed is not None:
         low, high = kind.fixed
         return Stretch(low, high, f"{low:g} to {high:g} {kind.shown_unit}".strip())
@@ -501,7 +514,7 @@ def stretch_of(kind: MapKind, values: NDArray[Any], maps: ShotMaps) -> Stretch:
 
 
 def drawn(kind: MapKind, values: NDArray[Any], maps: ShotMaps, stretch: Stretch, step: int = 1) -> Picture:
-    """Draw a map without a legend, every ``step``-th pixel: uint8 RGB [H, W, 3]."""
+    """Draw every ``step``-th pixel of a map without a legend, as uint8 RGB [H, W, 3]."""
     values = values[::step, ::step]
     dolp = maps.dolp[::step, ::step]
     reason = maps.reason[::step, ::step]
@@ -541,11 +554,11 @@ _GRAYS: dict[Look, str] = {
     "angle": "gray: dark, saturated or masked",
     "normal": "gray: no angle (noise, dark, saturated, masked)",
 }
-"""Meaning of gray pixels, by type of drawing."""
+"""Meaning of gray pixels in the legend, by type of picture."""
 
 
 def with_legend(picture: Picture, kind: MapKind, stretch: Stretch, title: str) -> Picture:
-    """Add a legend below a picture, and a white margin at the right of a narrow one."""
+    """Add a legend below a picture. A narrow picture also gets a white margin at the right."""
     width = max(picture.shape[1], _NARROWEST)
     picture = np.pad(picture, ((0, 0), (0, width - picture.shape[1]), (0, 0)), constant_values=255)
     scale = max(width / 1224, 0.6)
@@ -564,7 +577,7 @@ def with_legend(picture: Picture, kind: MapKind, stretch: Stretch, title: str) -
 
 
 def _color_key(kind: MapKind, stretch: Stretch, scale: float) -> Picture:
-    """Draw the key of the colors: a bar, a wheel, a ball or patches."""
+    """Draw the explanation of the colors: a bar, a wheel, a ball, or patches."""
     high = round(96 * scale)
     if kind.look == "scalar":
         middle = f"{(stretch.low + stretch.high) / 2:g}"
@@ -590,7 +603,7 @@ def _color_key(kind: MapKind, stretch: Stretch, scale: float) -> Picture:
 
 
 def _text(picture: Picture, text: str, place: tuple[int, int], size: float, width: int) -> None:
-    """Draw ASCII text, reduced in size until it fits into a width."""
+    """Draw ASCII text at a place, with a font that is small enough for a width."""
     text = text.encode("ascii", "replace").decode()
     while size > 0.3 and cv2.getTextSize(text, FONT, size, 1)[0][0] > width:
         size *= 0.95
@@ -598,7 +611,7 @@ def _text(picture: Picture, text: str, place: tuple[int, int], size: float, widt
 
 
 def _quantile(values: NDArray[Any], where: NDArray[np.bool_], q: float = 0.995) -> float:
-    """Return a quantile of the finite values of a mask; 1 without any."""
+    """Return a quantile of the finite values inside a mask; return 1 if there are no such values."""
     step = max(1, math.isqrt(values.size // _SAMPLES))
     numbers = values[::step, ::step][where[::step, ::step]]
     numbers = numbers[np.isfinite(numbers)]
@@ -606,7 +619,7 @@ def _quantile(values: NDArray[Any], where: NDArray[np.bool_], q: float = 0.995) 
 
 
 def _rounded_up(value: float) -> float:
-    """Return the next round number above a value, with a tolerance of a thousandth."""
+    """Return the next round number above a value. A round number may be smaller than the value by a thousandth."""
     if not value > 1e-6:
         return 1e-3
     power = 10.0 ** math.floor(math.log10(value))

@@ -1,4 +1,4 @@
-"""Polarized scenes with ground truth, rendered by physical light transport: the extra ``synth``.
+"""Render polarized scenes with ground truth by physical light transport (needs the extra ``synth``).
 
 ``schema`` validates a scene file. ``build`` converts it to meshes (``mesh``), textures (``textures``) and Mitsuba
 scenes. ``transport`` traces polarized paths. ``sensor`` renders the pixels of a camera and simulates photographs.

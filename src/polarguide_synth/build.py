@@ -1,4 +1,4 @@
-"""Mitsuba scenes from scene data: one scene for all wavelengths, or one each for red, green and blue.
+"""Build Mitsuba scenes from scene data: one scene for all wavelengths, or three scenes for red, green and blue.
 
 Procedural shapes are centered at the origin or stand on it, with z up. docs/reference/scene-files.md describes the
 fields of each ``shape``.
@@ -40,18 +40,18 @@ from polarguide_synth.transport import VISIBLE
 
 
 def sphere(radius: float = 1.0, detail: int = 96) -> Mesh:
-    """Mesh a ball, with exact normals."""
+    """Create the mesh of a ball, with exact normals."""
     polar = np.linspace(0, np.pi, detail // 2 + 1)
     ball = lathe([[np.sin(a), -np.cos(a)] for a in polar], segments=detail, smooth=0)
     return Mesh(radius * ball.points, ball.faces, ball.uv, unit(ball.points))
 
 
 def plane(size: tuple[float, float] = (1.0, 1.0), tile: float = 0.0) -> Mesh:
-    """Mesh a rectangle that faces up.
+    """Create the mesh of a horizontal rectangle that faces up.
 
     Args:
         size: lengths along x and y.
-        tile: length of one repeat of the texture; 0: the texture covers the rectangle once.
+        tile: length of one repeat of the texture. If 0, the texture covers the rectangle once.
     """
     corners = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
     points = np.column_stack(((2 * corners - 1) * size, np.zeros(4))) / 2
@@ -60,7 +60,7 @@ def plane(size: tuple[float, float] = (1.0, 1.0), tile: float = 0.0) -> Mesh:
 
 
 def box(size: tuple[float, float, float] = (1.0, 1.0, 1.0), bevel: float = 0.0, detail: int = 4) -> Mesh:
-    """Mesh a box with rounded edges. Each side shows the whole texture.
+    """Create the mesh of a box with rounded edges. Each side shows the whole texture.
 
     Args:
         size: lengths of the sides.
@@ -91,12 +91,13 @@ def box(size: tuple[float, float, float] = (1.0, 1.0, 1.0), bevel: float = 0.0, 
 
 
 def lathe(profile: list[list[float]], segments: int = 96, smooth: int = 8) -> Mesh:
-    """Mesh a surface of revolution about z.
+    """Create the mesh of a surface of revolution about z.
 
     Args:
         profile: points (radius, height), from bottom to top on the outside.
         segments: number of segments around z.
-        smooth: number of points of a Catmull-Rom curve between two points of the profile; 0: straight lines.
+        smooth: number of points of a Catmull-Rom curve between two points of the profile. If 0, the points are
+            connected by straight lines.
 
     Raises:
         ValueError: the profile is invalid, or a radius is negative.
@@ -121,7 +122,13 @@ def lathe(profile: list[list[float]], segments: int = 96, smooth: int = 8) -> Me
 
 
 def tube(path: list[list[float]], radius: float = 0.1, segments: int = 24, smooth: int = 8) -> Mesh:
-    """Mesh a round bar along a path through points [N, 3]; see ``lathe`` for ``segments`` and ``smooth``.
+    """Create the mesh of a round bar along a path.
+
+    Args:
+        path: points of the path, [N, 3].
+        radius: radius of the bar.
+        segments: number of segments around the path.
+        smooth: number of points of a Catmull-Rom curve between two points of the path, as in ``lathe``.
 
     Raises:
         ValueError: the path is invalid.
@@ -145,7 +152,7 @@ def waves(
     length: float = 0.5,
     seed: int = 0,
 ) -> Mesh:
-    """Mesh a rectangle that faces up, with smooth random waves.
+    """Create the mesh of a horizontal rectangle that faces up, with smooth random waves.
 
     Args:
         size: lengths along x and y.
@@ -164,7 +171,7 @@ def waves(
 
 
 def rock(radius: float = 1.0, rough: float = 0.25, seed: int = 0, detail: int = 96) -> Mesh:
-    """Mesh a ball with random bumps of ``rough`` times its radius."""
+    """Create the mesh of a ball with random bumps, whose height is up to ``rough`` times the radius."""
     ball = sphere(1.0, detail)
     bumps = fractal_noise(ball.points * 1.3 + 10, seed, octaves=4) - 0.5
     points = radius * ball.points * (1 + 2 * rough * bumps[:, None])
@@ -172,9 +179,12 @@ def rock(radius: float = 1.0, rough: float = 0.25, seed: int = 0, detail: int = 
 
 
 def _grid_mesh(points: Array, uv: Array, normals: Array, facing: int = 1) -> Mesh:
-    """Return the mesh of a grid: points and normals [R, C, 3], uv [R, C, 2].
+    """Create a mesh from points on a grid.
 
     Args:
+        points: points [R, C, 3].
+        uv: texture coordinates [R, C, 2].
+        normals: normals [R, C, 3].
         facing: 1 if columns proceed counter-clockwise from rows as seen from outside, else -1.
     """
     faces = grid_faces(*points.shape[:2])
@@ -186,7 +196,7 @@ def _corners(points: list[list[float]], axes: int) -> Array:
     """Return points as an array [N, axes].
 
     Raises:
-        ValueError: the points are fewer than two, or have another number of coordinates.
+        ValueError: there are fewer than two points, or a point has the wrong number of coordinates.
     """
     try:
         corners = np.array(points, float)
@@ -200,7 +210,7 @@ def _corners(points: list[list[float]], axes: int) -> Array:
 def _curve(points: Array, between: int) -> Array:
     """Sample the Catmull-Rom curve through points, with ``between`` samples between two points.
 
-    The ends are extrapolated linearly. Fewer than three points are returned unchanged.
+    The curve is extrapolated linearly at its ends. If there are fewer than three points, they are returned unchanged.
     """
     if between == 0 or len(points) < 3:
         return points.copy()
@@ -220,7 +230,7 @@ SHAPES: dict[str, Callable[..., Mesh]] = {
 
 
 def make_mesh(shape: dict[str, Any], where: str) -> Mesh:
-    """Create the mesh of the data of a shape.
+    """Create the mesh of a shape from its data.
 
     Raises:
         PolarguideError: the type, a field or a value is invalid.
@@ -229,12 +239,12 @@ def make_mesh(shape: dict[str, Any], where: str) -> Mesh:
 
 
 def bsdf_dict(material: Material, texture: Array | None, channel: int | None) -> dict[str, Any]:
-    """Return Mitsuba's dictionary of the BSDF of a material.
+    """Return Mitsuba's dictionary for the BSDF of a material.
 
     Args:
-        material: the surface.
-        texture: base color [H, W, 3]; None: the color of the material.
-        channel: 0 to 2 for red, green or blue; None: all wavelengths.
+        material: the material.
+        texture: base color [H, W, 3]. If None, the color of the material is used.
+        channel: 0 to 2 for red, green or blue. If None, the BSDF is for all wavelengths.
     """
     base = _value(material.color, channel) if texture is None else _bitmap(texture, channel)
     if material.type == "metal":
@@ -249,14 +259,14 @@ def bsdf_dict(material: Material, texture: Array | None, channel: int | None) ->
 
 
 def _value(color: Any, channel: int | None) -> dict[str, Any]:
-    """Return the dictionary of a reflectance or radiance."""
+    """Return Mitsuba's dictionary for a reflectance or radiance."""
     if channel is None:
         return {"type": "rgb", "value": [float(c) for c in color]}
     return {"type": "uniform", "value": float(color[channel])}
 
 
 def _metal(index: tuple[float, float, float], channel: int | None) -> dict[str, Any]:
-    """Return the dictionary of a spectrum with values at red, green and blue."""
+    """Return Mitsuba's dictionary for a spectrum with given values at red, green and blue."""
     if channel is not None:
         return _value(index, channel)
     red, green, blue = index
@@ -265,7 +275,10 @@ def _metal(index: tuple[float, float, float], channel: int | None) -> dict[str, 
 
 
 def _bitmap(texture: Array, channel: int | None) -> dict[str, Any]:
-    """Return the dictionary of a texture [H, W, 3]; a texture of one row is a palette and is not interpolated."""
+    """Return Mitsuba's dictionary for a texture [H, W, 3].
+
+    A texture of one row is a palette, whose colors are not interpolated.
+    """
     part = texture if channel is None else texture[..., channel : channel + 1]
     # Rows of a picture go down, v goes up.
     bitmap = mi.Bitmap(np.ascontiguousarray(part[::-1], np.float32))
@@ -274,7 +287,7 @@ def _bitmap(texture: Array, channel: int | None) -> dict[str, Any]:
 
 
 def environment_dict(panorama: Array, channel: int | None) -> dict[str, Any]:
-    """Return the dictionary of the environment emitter of a panorama [H, W, 3]."""
+    """Return Mitsuba's dictionary for an environment light with a panorama [H, W, 3]."""
     part = panorama if channel is None else np.repeat(panorama[..., channel : channel + 1], 3, -1)
     # The left edge of Mitsuba's panoramas is its -z; y is up and columns proceed to the right.
     axes = np.array([[0, 0, -1, 0], [-1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]], float)
@@ -283,12 +296,12 @@ def environment_dict(panorama: Array, channel: int | None) -> dict[str, Any]:
 
 
 def visibility_dict(spec: SceneSpec, visible: bool) -> dict[str, Any]:
-    """Return the visibility attribute of a shape; empty if the camera sees all shapes."""
+    """Return Mitsuba's attribute for the visibility of a shape. It is empty if the camera sees all shapes."""
     return {VISIBLE: _value((float(visible),), 0)} if spec.object_only else {}
 
 
 def area_light_dict(light: dict[str, Any], channel: int | None, where: str) -> dict[str, Any]:
-    """Return the dictionary of a rectangular area light.
+    """Return Mitsuba's dictionary for a rectangular area light.
 
     Args:
         light: data of the light.
@@ -322,9 +335,9 @@ class BuiltScene:
 
     Attributes:
         spec: the scene data.
-        scenes: Mitsuba's scenes, one or three (see ``sensor.render_lobes``).
+        scenes: one or three scenes of Mitsuba (see ``sensor.render_lobes``).
         shapes: Mitsuba's shapes of the objects in the first scene, in the order of the data.
-        textures: textures of the objects, [H, W, 3] with rows from the top down; None for objects of one color.
+        textures: texture of each object, [H, W, 3] with rows from the top down. None for an object of one color.
     """
 
     spec: SceneSpec
@@ -334,12 +347,12 @@ class BuiltScene:
 
     @property
     def visible(self) -> NDArray[np.bool_]:
-        """Visibility of the objects to the camera, by number; number 0 stands for no object."""
+        """True for each object that the camera sees, by the number of the object. Number 0 stands for no object."""
         return np.array([False, *self.spec.visible])
 
 
 def build_scene(spec: SceneSpec, folder: Path, variant: Variant) -> BuiltScene:
-    """Generate meshes, textures and the environment of a scene, write them and load them.
+    """Generate the meshes, textures and environment of a scene, write them to files, and load them into Mitsuba.
 
     The files are ``mesh/<thing>.ply`` and ``environment.hdr``.
 
@@ -378,7 +391,7 @@ def build_scene(spec: SceneSpec, folder: Path, variant: Variant) -> BuiltScene:
 
 
 def _mesh(thing: Thing, spec: SceneSpec) -> Mesh:
-    """Create the mesh of an object, placed in the scene.
+    """Create the mesh of an object at its place in the scene.
 
     Raises:
         PolarguideError: the shape is invalid, or has no extent.
@@ -397,7 +410,7 @@ def _mesh(thing: Thing, spec: SceneSpec) -> Mesh:
 
 
 def _user_mesh(path: Path) -> Mesh:
-    """Read the mesh in a user's PLY or OBJ file by Mitsuba.
+    """Read the mesh in a user's PLY or OBJ file with Mitsuba.
 
     Raises:
         PolarguideError: the file is missing, damaged or of another type.
@@ -411,7 +424,7 @@ def _user_mesh(path: Path) -> Mesh:
         found=f"a name that ends in {path.suffix or 'nothing'}" if path.is_file() else "nothing",
         remedy="File names of meshes are relative to the folder of the scene file.",
     )
-    # Without normals first: Mitsuba computes normals before it validates corners, and writes out of bounds.
+    # Read without normals first, because Mitsuba would compute normals before it validates the indices of corners.
     params = _mesh_arrays(path, kind, flat=True)
     points = np.array(params["vertex_positions"], float).reshape(-1, 3)
     faces = np.array(params["faces"], np.int64).reshape(-1, 3)
@@ -438,7 +451,7 @@ def _mesh_arrays(path: Path, kind: str, *, flat: bool) -> Any:
     Args:
         path: path of the file.
         kind: "ply" or "obj".
-        flat: leave vertex normals out.
+        flat: True to omit vertex normals.
 
     Raises:
         PolarguideError: Mitsuba cannot read the file.
@@ -459,7 +472,7 @@ def _mesh_arrays(path: Path, kind: str, *, flat: bool) -> Any:
 
 
 def _texture(thing: Thing, mesh: Mesh, folder: Path) -> Array | None:
-    """Return the texture of an object, [H, W, 3], or None for an object of one color.
+    """Return the texture [H, W, 3] of an object. Return None for an object of one color.
 
     Raises:
         PolarguideError: the texture is invalid, or the mesh has no colors for the color "own".
@@ -478,11 +491,11 @@ def _texture(thing: Thing, mesh: Mesh, folder: Path) -> Array | None:
 
 
 def _shape(thing: Thing, mesh: Mesh, path: Path, surface: dict[str, Any]) -> Any:
-    """Load Mitsuba's shape of an object.
+    """Create Mitsuba's shape of an object.
 
     Args:
         thing: the object.
-        mesh: its mesh.
+        mesh: mesh of the object.
         path: file of the mesh.
         surface: BSDF and attributes.
     """

@@ -1,4 +1,4 @@
-"""Camera poses, and the simulation of a COLMAP model with errors."""
+"""Place cameras, and simulate the COLMAP model that structure from motion would give, including its errors."""
 
 from __future__ import annotations
 
@@ -18,14 +18,15 @@ from polarguide_synth.schema import CameraPath
 
 
 def place_cameras(path: CameraPath, width: int, height: int, seed: int) -> list[Camera]:
-    """Create the cameras of a path, ring by ring, in the order of their angle about z.
+    """Create the cameras of a path. They are sorted by ring, and within a ring by their angle about z.
 
-    Radius, height and angle are jittered by a few percent: the views do not lie on exact circles.
+    Radius, height and angle are changed randomly by a few percent, so that the views do not lie on exact circles.
 
     Args:
         path: data of the rings.
-        width, height: size of the pictures in pixels.
-        seed: seed of the jitter.
+        width: width of the pictures in pixels.
+        height: height of the pictures in pixels.
+        seed: seed of the random changes.
     """
     random = np.random.default_rng((seed, 11))
     shares = np.array([float(ring.get("share", 1.0)) for ring in path.rings])
@@ -54,25 +55,25 @@ def place_cameras(path: CameraPath, width: int, height: int, seed: int) -> list[
 
 
 NOISE_PIXELS = 0.6
-"""Standard deviation of observations in pixels."""
+"""Standard deviation of the positions at which points are observed, in pixels."""
 OUTLIERS = 0.01
-"""Share of points at a wrong distance."""
+"""Share of points that are placed at a wrong distance."""
 VIRTUAL = 0.02
-"""Share of points that are virtual images of reflected points."""
+"""Share of points that are mirror images of reflected points."""
 SMOOTH = 0.1
-"""Roughness below which reflections are sharp enough to be matched."""
+"""Roughness below which structure from motion can match points in reflections."""
 MATCHED_SHARE = 0.6
-"""Probability that a view that sees a point observes it."""
+"""Probability that a point is observed by a view that sees it."""
 
 
 @dataclass(frozen=True, eq=False)
 class SparsePoints:
-    """Points and their observations.
+    """Points of a simulated COLMAP model, with their observations.
 
     Attributes:
-        points: [M, 3].
-        colors: [M, 3] display-encoded.
-        tracks: tracks of the points, with (view, x, y) of each observation.
+        points: [M, 3] positions.
+        colors: [M, 3] display-encoded colors.
+        tracks: observations of each point, as triples of the view and the position x, y in pixels.
     """
 
     points: Array
@@ -83,7 +84,7 @@ class SparsePoints:
 def sample_sparse_points(
     built: BuiltScene, cameras: Sequence[Camera], pictures: Sequence[NDArray[np.uint8]], count: int, seed: int
 ) -> SparsePoints:
-    """Sample points as structure from motion finds them, with noise, outliers and virtual images.
+    """Sample points as structure from motion finds them: with noise, outliers, and mirror images of reflections.
 
     Args:
         built: the scene.
@@ -124,7 +125,7 @@ def sample_sparse_points(
 
 
 def _visible(built: BuiltScene, cameras: Sequence[Camera], places: Array) -> NDArray[np.bool_]:
-    """Return a mask [M, V] of the points [M, 3] that each camera sees."""
+    """Return a mask [M, V] that is True if a point is visible to a camera, for points [M, 3]."""
     visible = np.zeros((len(places), len(cameras)), bool)
     for number, camera in enumerate(cameras):
         x, y, z = _project(camera, places).T
@@ -149,18 +150,19 @@ def _mirrored(
     thing: NDArray[np.uint8],
     random: np.random.Generator,
 ) -> tuple[NDArray[np.bool_], Array]:
-    """Replace some points on smooth surfaces by the virtual images of reflected points.
+    """Replace some points on smooth surfaces by the mirror images of reflected points.
 
     Args:
         built: the scene.
-        origin, ray: camera center and direction [M, 3] of each point.
+        origin: camera center of each point, [M, 3].
+        ray: direction from the camera to each point, [M, 3].
         places: the points [M, 3].
         normal: surface normals [M, 3].
         thing: numbers of the objects [M].
         random: generator of random numbers.
 
     Returns:
-        A mask [M] of the replaced points, and all points [M, 3].
+        A mask [M] of the replaced points; and all points [M, 3].
     """
     sharp = np.array([False] + [item.material.roughness < SMOOTH for item in built.spec.things])
     chosen = np.flatnonzero(
@@ -182,7 +184,11 @@ def _mirrored(
 def _track(
     place: Array, views: NDArray[np.int64], cameras: Sequence[Camera], random: np.random.Generator
 ) -> list[tuple[int, float, float]]:
-    """Observe a point [3] with noise: (view, x, y) in each view that it lies in front of."""
+    """Simulate noisy observations of a point [3].
+
+    Returns:
+        Triples (view, x, y), one for each view in front of which the point lies.
+    """
     track = []
     for view in views:
         x, y, z = _project(cameras[view], place[None])[0]
@@ -193,7 +199,7 @@ def _track(
 
 
 def _project(camera: Camera, places: Array) -> Array:
-    """Project points [M, 3]: x and y in pixels, and z, [M, 3]."""
+    """Project points [M, 3] to x and y in pixels, and the depth z, [M, 3]."""
     x, y, depth = (places @ camera.rotation.numpy().T + camera.translation.numpy()).T
     z = np.where(np.abs(depth) < 1e-9, 1e-9, depth)
     return np.stack((camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy, depth), -1)
@@ -204,7 +210,8 @@ def write_model(folder: Path, cameras: Sequence[Camera], names: Sequence[str], s
 
     Args:
         folder: folder to write.
-        cameras, names: cameras and names of the views.
+        cameras: cameras of the views.
+        names: names of the views.
         sparse: points with their observations.
 
     Raises:

@@ -1,4 +1,4 @@
-"""Files of a rendered scene: request, pictures, checksums and ``scene.json``.
+"""Read and write the files of a rendered scene: request, pictures, checksums and ``scene.json``.
 
 The folder is written view by view. An interrupted rendering can therefore be resumed.
 """
@@ -29,23 +29,23 @@ from polarguide_synth.settings import SynthSettings, Variant
 
 State = Literal["new", "begun", "finished"]
 REQUEST = "request.json"
-"""Name of the file with the requested rendering."""
+"""Name of the file that records the scene and the settings of a rendering."""
 STEP = 16
-"""Step of the stored values. Pictures have 12 bits in 16, like those of cameras."""
+"""Difference between two successive stored values. Pictures have 12 bits in 16, like those of cameras."""
 TOP = 65535 // STEP
 """Largest 12-bit value."""
 
 
 def scene_request(spec: SceneSpec, settings: SynthSettings) -> dict[str, Any]:
-    """Return the content of ``request.json``, the requested rendering."""
+    """Return the content of ``request.json``: the scene and the settings of a rendering."""
     return {"scene": spec.data(), "settings": settings.data()}
 
 
 def folder_state(out: Path, request: dict[str, Any]) -> State:
-    """Return the state of the rendering of a request in a folder. Nothing is written.
+    """Return how far the rendering in a folder has progressed. Nothing is written.
 
     Raises:
-        PolarguideError: the folder holds other files, or the same scene with other settings.
+        PolarguideError: the folder contains other files, or the same scene with other settings.
     """
     path = out / REQUEST
     remedy = "Give another --out, or remove the folder."
@@ -64,7 +64,7 @@ def folder_state(out: Path, request: dict[str, Any]) -> State:
         field, was, requested = first_differing_value("", before, now)
         raise PolarguideError(
             out,
-            expected="a scene that was begun with the same settings",
+            expected="a scene that was started with the same settings",
             found=f"other settings ({field[1:]}: {shortened(was)} in place of {shortened(requested)})",
             remedy=remedy,
         )
@@ -72,7 +72,7 @@ def folder_state(out: Path, request: dict[str, Any]) -> State:
 
 
 def write_file(path: Path, data: bytes) -> None:
-    """Write a file atomically, and create its folder.
+    """Write a file atomically. Its folder is created if it does not exist.
 
     Raises:
         PolarguideError: the file cannot be written.
@@ -82,24 +82,24 @@ def write_file(path: Path, data: bytes) -> None:
 
 
 def sensor_codes(stokes: Array, change: Callable[[Array], Array]) -> NDArray[np.uint16]:
-    """Return the four pictures behind a polarizer as a 12-bit sensor stores them, [4, H, W, 3].
+    """Return the pictures behind polarizers at four angles as a 12-bit sensor stores them, [4, H, W, 3].
 
     Args:
-        stokes: [3, H, W, 3], full scale 1.
-        change: function of the intensities [4, H, W, 3] before they are stored, for noise.
+        stokes: Stokes vectors [3, H, W, 3], full scale 1.
+        change: function that changes the intensities [4, H, W, 3] before they are stored, for example to add noise.
     """
     light = np.stack([malus(stokes, np.radians(angle)) for angle in ANGLES])
     return np.clip(np.round(change(light) * (65535 / STEP)), 0, TOP).astype(np.uint16) * STEP
 
 
 def clipped_share(out: Path, names: Sequence[str]) -> float:
-    """Return the share of the samples of the views' pictures that are at full scale."""
+    """Return the share of samples that are at full scale in the pictures of all views."""
     files = [file for name in names for file in view_files(out, name, ground_truth=False, raw=False)]
     return float(np.mean([(_picture(file) == TOP * STEP).mean() for file in files]))
 
 
 def view_files(out: Path, name: str, *, ground_truth: bool, raw: bool) -> list[Path]:
-    """Return the paths of all files of a view. A view is finished when they exist."""
+    """Return the paths of all files of a view. The view is finished when all files exist."""
     files = [out / picture_name(name, angle) for angle in ANGLES]
     files += [out / "gt" / f"{name}.npz"] if ground_truth else []
     return files + ([out / "raw" / f"{name}.png"] if raw else [])
@@ -118,14 +118,14 @@ def _picture(file: Path) -> Array:
 
 
 MANIFEST = "checksums.txt"
-"""Name of the list of checksums."""
+"""Name of the file with the checksums."""
 _REMEDY = "Remove the folder to render the scene again, or give another --out."
 _FOLDERS = ("gt", "mesh", "polar", "raw", "sparse")
 _FILES = ("calibration.json", "environment.hdr", "request.json", "sheet.jpg", "split.json")
 
 
 def write_manifest(out: Path) -> str:
-    """Write the checksums of a scene that is complete except for ``scene.json``, and return their SHA-256."""
+    """Write the checksums of all files except ``scene.json``, and return the SHA-256 of the list."""
     lines = [f"{_digest(path)}  {path.relative_to(out).as_posix()}\n" for path in sorted(_written(out))]
     data = "".join(lines).encode()
     write_file(out / MANIFEST, data)
@@ -133,7 +133,7 @@ def write_manifest(out: Path) -> str:
 
 
 def verify_scene(out: Path) -> str:
-    """Compare a finished scene with its checksums, and return their SHA-256.
+    """Compare a finished scene with its checksums, and return the SHA-256 of their list.
 
     Raises:
         PolarguideError: a file or the list of checksums is missing or has changed.
@@ -153,12 +153,12 @@ def verify_scene(out: Path) -> str:
 
 
 def scene_digest(out: Path) -> str:
-    """Return the digest in ``scene.json``, or an empty string."""
+    """Return the SHA-256 that ``scene.json`` states, or an empty string."""
     return str(read_record(out / "scene.json", dict[str, Any], remedy=_REMEDY).get("sha256", ""))
 
 
 def _written(out: Path) -> Iterator[Path]:
-    """List the files that rendering writes. Other files in the folder are the user's."""
+    """List the files that a rendering writes. Any remaining file in the folder belongs to the user."""
     for name in _FOLDERS:
         yield from (path for path in (out / name).rglob("*") if path.is_file() and path.name[0] != ".")
     yield from (out / name for name in _FILES if (out / name).is_file())
@@ -173,7 +173,7 @@ def _require(condition: bool, path: Path, expected: str) -> None:
         condition,
         path,
         expected=expected,
-        found="another" if path.is_file() else "no file",
+        found="a file with other contents" if path.is_file() else "no file",
         remedy=_REMEDY,
     )
 
@@ -193,7 +193,7 @@ CONVENTION = {
     ),
     "environment": "environment.hdr: rows from +z down, columns clockwise seen from above, from +x; scene units",
 }
-"""Conventions of the files, as recorded in ``scene.json``."""
+"""Description of the conventions of the files, which is stored in ``scene.json``."""
 
 
 def scene_record(
@@ -209,10 +209,12 @@ def scene_record(
     """Return the content of ``scene.json``.
 
     Args:
-        spec, settings, variant: scene, settings and variant of Mitsuba.
+        spec: the scene.
+        settings: settings of the rendering.
+        variant: variant of Mitsuba.
         names: names of the views.
         tests: names of the held-out views.
-        exposure: values of the pictures per radiance.
+        exposure: factor from radiance to the values of the pictures.
         clipped: share of clipped samples.
     """
     objects = [

@@ -1,4 +1,4 @@
-"""Ground truth by ray casting: normals, depth, masks and materials of the surfaces of a scene."""
+"""Compute ground truth by ray casting: normals, depth, masks and materials of the surfaces of a scene."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ from polarguide_synth.settings import dr, mi
 
 @dataclass(frozen=True, eq=False)
 class Intersections:
-    """The first intersections of rays with surfaces.
+    """First intersections of rays with the surfaces of a scene.
 
     Attributes:
-        distance: [N] along the ray, 0 without intersection.
-        normal: [N, 3] unit shading normal that faces the ray's origin, 0 without intersection.
-        thing: [N] number of the object, counted from 1; 0 for a light source or no intersection.
+        distance: [N] distance along the ray, 0 without an intersection.
+        normal: [N, 3] unit shading normal on the side of the ray's origin, 0 without an intersection.
+        thing: [N] number of the object, counted from 1. 0 for a light source or no intersection.
         uv: [N, 2] texture coordinates.
     """
 
@@ -57,7 +57,7 @@ def intersect(built: BuiltScene, origins: Array, toward: Array) -> Intersections
 
 
 def _intersect(built: BuiltScene, origin: Any, direction: Any) -> tuple[Any, Any, Any, Any]:
-    """Return distance, normal, number of the object and texture coordinates, in Mitsuba's types."""
+    """Return distance, normal, number of the object, and texture coordinates, as types of Mitsuba."""
     si = built.scenes[0].ray_intersect(mi.Ray3f(origin, direction))
     if mi.variant().startswith("scalar"):
         number = next((k + 1 for k, shape in enumerate(built.shapes) if shape == si.shape), 0)
@@ -69,13 +69,13 @@ def _intersect(built: BuiltScene, origin: Any, direction: Any) -> tuple[Any, Any
 
 
 def ground_truth_maps(built: BuiltScene, camera: Camera) -> dict[str, NDArray[Any]]:
-    """Compute the ground truth of a view, with the keys of a ground-truth file.
+    """Compute the ground truth of a view, by the keys of a ground-truth file.
 
-    Objects that are black to the camera are background. Base color is the mean over each pixel. Other maps are values
-    at pixel centers.
+    Objects that are black to the camera are background. Base color is the mean over each pixel. All other maps contain
+    values at pixel centers.
 
     Returns:
-        Maps of [H, W] or [H, W, 3].
+        Maps [H, W] or [H, W, 3] by key.
     """
     rays = camera.world_rays().numpy().astype(np.float64).reshape(-1, 3)
     hits = intersect(built, np.broadcast_to(camera.center.numpy(), rays.shape), rays)
@@ -95,17 +95,17 @@ def ground_truth_maps(built: BuiltScene, camera: Camera) -> dict[str, NDArray[An
 
 
 SUBPIXELS = 4
-"""Number of rays along a pixel's side for base color.
+"""Number of rays along each side of a pixel, over which its base color is averaged.
 
-One ray at the center differs from the mean by 1.5 to 3.5 dB at edges of textures.
+At edges of textures, one ray at the center differs from the mean by 1.5 to 3.5 dB.
 """
 
 
 def base_colors(built: BuiltScene, hits: Intersections) -> Array:
-    """Return the base color [N, 3] at intersections as glTF defines it; 0 without an object.
+    """Return the base color [N, 3] at intersections, in the sense of glTF. It is 0 without an object.
 
-    Base color is the reflectance of the diffuse base of plastic and matte objects, and the reflectance at normal
-    incidence of metals.
+    For plastic and matte objects, the base color is the reflectance of the diffuse base. For metals, it is the
+    reflectance at normal incidence.
     """
     colors = np.zeros((len(hits.thing), 3))
     for number, (thing, texture) in enumerate(zip(built.spec.things, built.textures, strict=True), 1):
@@ -123,10 +123,12 @@ def base_colors(built: BuiltScene, hits: Intersections) -> Array:
 
 
 def _texture_values(texture: Array, uv: Array) -> Array:
-    """Interpolate a texture [H, W, 3] at uv [N, 2] like Mitsuba: bilinear and repeated; nearest for a palette.
+    """Sample a texture [H, W, 3] at coordinates [N, 2] like Mitsuba.
+
+    The texture is repeated and interpolated bilinearly. A palette is not interpolated.
 
     Returns:
-        [N, 3].
+        Colors [N, 3].
     """
     height, width = texture.shape[:2]
     column = uv[:, 0] * width
@@ -145,7 +147,10 @@ def _texture_values(texture: Array, uv: Array) -> Array:
 
 
 def _pixel_albedo(built: BuiltScene, camera: Camera) -> Array:
-    """Return the base color [H, W, 3], averaged over the part of each pixel that shows an object; 0 without one."""
+    """Return the base color [H, W, 3] of each pixel, averaged over its part that shows an object.
+
+    It is 0 if the pixel shows no object.
+    """
     fine = camera.scaled(SUBPIXELS, SUBPIXELS * camera.width, SUBPIXELS * camera.height)
     rays = fine.world_rays().numpy().astype(np.float64).reshape(-1, 3)
     hits = intersect(built, np.broadcast_to(fine.center.numpy(), rays.shape), rays)
@@ -156,7 +161,10 @@ def _pixel_albedo(built: BuiltScene, camera: Camera) -> Array:
 
 
 def _materials(spec: SceneSpec, thing: NDArray[np.uint8]) -> dict[str, NDArray[np.float16]]:
-    """Return maps of GGX alpha (1 for matte), metalness (0 or 1) and refractive index (0 except for dielectrics)."""
+    """Return maps of the material.
+
+    The maps are GGX alpha (1 for matte), metalness (0 or 1), and refractive index (0 except for dielectrics).
+    """
     materials = [each.material for each in spec.things]
     values = {
         "roughness": [1.0 if material.type == "matte" else material.roughness for material in materials],
@@ -167,17 +175,17 @@ def _materials(spec: SceneSpec, thing: NDArray[np.uint8]) -> dict[str, NDArray[n
 
 
 COLUMNS = ("photograph", "DoLP", "AoLP", "specular", "diffuse", "normals", "depth")
-"""Labels of the layers in the sheet."""
+"""Labels of the columns of the overview picture."""
 ROWS = 3
-"""Largest number of views in the sheet."""
+"""Largest number of views in the overview picture."""
 WIDEST = 320
-"""Largest width of a layer in the sheet, in pixels."""
+"""Largest width of a single map in the overview picture, in pixels."""
 QUALITY = 82
-"""JPEG quality of the sheet."""
+"""JPEG quality of the overview picture."""
 
 
 def write_sheet(out: Path, names: Sequence[str], cameras: Sequence[Camera]) -> None:
-    """Write ``sheet.jpg`` with up to ``ROWS`` views. All views need ground truth."""
+    """Write the overview picture ``sheet.jpg`` with up to ``ROWS`` views. All views need ground truth."""
     chosen = sorted({round(k) for k in np.linspace(0, len(names) - 1, min(ROWS, len(names)))})
     rows = [_layers(out / "gt" / f"{names[k]}.npz", cameras[k]) for k in chosen]
     sheet = contact_sheet(rows, [names[k] for k in chosen], COLUMNS, maximum_width=WIDEST)
@@ -186,7 +194,7 @@ def write_sheet(out: Path, names: Sequence[str], cameras: Sequence[Camera]) -> N
 
 
 def _layers(path: Path, camera: Camera) -> list[Picture]:
-    """Draw the layers of a view, [H, W, 3] each, in the order of ``COLUMNS``."""
+    """Draw the maps of a view, [H, W, 3] each, in the order of ``COLUMNS``."""
     with np.load(path) as ground_truth:
         stokes, specular, diffuse, normal, depth = (
             torch.from_numpy(ground_truth[name].astype(np.float32))

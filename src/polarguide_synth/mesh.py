@@ -1,6 +1,6 @@
-"""Triangle meshes as arrays, and meshes of implicit surfaces.
+"""Triangle meshes as arrays, and meshes of solids that are blended from primitives.
 
-An implicit surface consists of primitives that are blended by the polynomial smooth minimum of their signed distances.
+A solid consists of primitives. The signed distances to the primitives are combined by the polynomial smooth minimum.
 Naive surface nets yield the triangles, and Newton's method moves them onto the surface. Normals are gradients of the
 distance. Highlights are therefore smooth across blends.
 """
@@ -26,11 +26,11 @@ class Mesh:
     """A triangle mesh.
 
     Attributes:
-        points: [V, 3].
-        faces: [F, 3] indices, counter-clockwise seen from outside.
+        points: [V, 3] vertices.
+        faces: [F, 3] indices of vertices, counter-clockwise as seen from outside.
         uv: [V, 2] texture coordinates.
         normals: [V, 3] unit shading normals, or None for flat triangles.
-        palette: [N, 3] linear colors along u of a shape with its own colors; None for others.
+        palette: [N, 3] linear colors that u selects, for a shape with its own colors. None for all other shapes.
     """
 
     points: Array
@@ -47,7 +47,7 @@ class Mesh:
 
 
 def joined(meshes: list[Mesh]) -> Mesh:
-    """Concatenate meshes, with normals if all have normals."""
+    """Concatenate meshes. The result has normals if all meshes have normals."""
     starts = np.cumsum([0] + [len(mesh.points) for mesh in meshes[:-1]])
     normals = [mesh.normals for mesh in meshes if mesh.normals is not None]
     return Mesh(
@@ -59,7 +59,10 @@ def joined(meshes: list[Mesh]) -> Mesh:
 
 
 def smooth_normals(points: Array, faces: NDArray[np.int64]) -> Array:
-    """Compute vertex normals, area-weighted means of face normals over all vertices at one position."""
+    """Compute the normal of each vertex as the area-weighted mean of the normals of its faces.
+
+    Vertices at the same position share a normal.
+    """
     _, place = np.unique(np.round(points, 9), axis=0, return_inverse=True)
     a, b, c = (points[faces[:, k]] for k in range(3))
     across = np.cross(b - a, c - a)
@@ -70,7 +73,7 @@ def smooth_normals(points: Array, faces: NDArray[np.int64]) -> Array:
 
 
 def grid_faces(rows: int, columns: int) -> NDArray[np.int64]:
-    """Return the triangles [F, 3] between points [rows, columns] in row order."""
+    """Return the triangles [F, 3] between points on a grid of rows and columns, numbered row by row."""
     index = np.arange(rows * columns).reshape(rows, columns)
     corners = (index[:-1, :-1], index[:-1, 1:], index[1:, :-1], index[1:, 1:])
     a, b, c, d = (corner.ravel() for corner in corners)
@@ -78,7 +81,7 @@ def grid_faces(rows: int, columns: int) -> NDArray[np.int64]:
 
 
 def rotation(degrees: tuple[float, float, float]) -> Array:
-    """Return the matrix [3, 3] of rotations about x, then y, then z, in degrees."""
+    """Return the matrix [3, 3] that rotates about x, then about y, then about z, by angles in degrees."""
     cx, cy, cz = np.cos(np.radians(degrees))
     sx, sy, sz = np.sin(np.radians(degrees))
     about_x = np.array([[1, 0, 0], [0, cx, -sx], [0, sx, cx]])
@@ -88,7 +91,7 @@ def rotation(degrees: tuple[float, float, float]) -> Array:
 
 
 def write_ply(path: Path, mesh: Mesh) -> None:
-    """Write a binary PLY file with texture coordinates ``u``, ``v``, and normals if the mesh has normals.
+    """Write a binary PLY file with texture coordinates ``u``, ``v``, and with normals if the mesh has them.
 
     Raises:
         PolarguideError: the file cannot be written.
@@ -109,14 +112,14 @@ def write_ply(path: Path, mesh: Mesh) -> None:
 
 
 def primitive_distance(points: Array, part: dict[str, Any]) -> Array:
-    """Compute the signed distance from points [..., 3] to a primitive, [...].
+    """Compute the signed distances [...] from points [..., 3] to a primitive.
 
     Args:
         points: the points.
         part: data of the primitive, see ``solid``.
 
     Returns:
-        The distance; for an ellipsoid, a first-order approximation.
+        The distances. They are exact except for an ellipsoid, for which they are a first-order approximation.
 
     Raises:
         ValueError: the kind is unknown.
@@ -152,20 +155,24 @@ def primitive_distance(points: Array, part: dict[str, Any]) -> Array:
 
 
 def _rounded_box(sides: Array, radius: float) -> Array:
-    """Compute the signed distance to a box with rounded edges from the distances to its pairs of sides [..., K]."""
+    """Compute the signed distance to a box with rounded edges.
+
+    ``sides`` [..., K] contains the signed distance to each pair of opposite sides. ``radius`` is the radius of the
+    edges.
+    """
     sides = sides + radius
     distance = np.linalg.norm(np.maximum(sides, 0), axis=-1) + np.minimum(sides.max(-1), 0)
     return np.asarray(distance - radius)
 
 
 def surface_nets(values: Array) -> tuple[Array, np.ndarray]:
-    """Mesh the zero level of a grid by naive surface nets (Gibson 1998).
+    """Create the mesh of the zero level of a grid by naive surface nets (Gibson 1998).
 
     Args:
         values: signed distances on a grid, [X, Y, Z], negative inside.
 
     Returns:
-        Vertices [V, 3] in units of cells, and triangles [F, 3].
+        Vertices [V, 3] in units of cells; and triangles [F, 3].
     """
     inside = values < 0
     shape = tuple(n - 1 for n in values.shape)
@@ -201,17 +208,17 @@ def surface_nets(values: Array) -> tuple[Array, np.ndarray]:
 
 
 NEWTON_STEPS = 2
-"""Number of steps of Newton's method onto the surface."""
+"""Number of steps of Newton's method that move vertices onto the surface."""
 COARSE = 4
-"""Side of the cells of the coarse grid, in cells of the fine grid."""
+"""Width of the cells of the coarse grid, in cells of the fine grid."""
 FEW = 8
-"""Number of parts from which distances are evaluated by blocks."""
+"""Smallest number of parts for which distances are evaluated block by block."""
 BLOCK = 10
-"""Side of the blocks that are evaluated together, in cells."""
+"""Width of a block of the grid in cells. Distances of a block are evaluated together."""
 
 
 def solid(parts: list[dict[str, Any]], blend: float = 0.03, detail: int = 96) -> Mesh:
-    """Mesh a union of blended primitives.
+    """Create the mesh of a union of primitives with smooth transitions.
 
     Each part has a ``kind`` with these fields:
 
@@ -221,8 +228,8 @@ def solid(parts: list[dict[str, Any]], blend: float = 0.03, detail: int = 96) ->
     - ``cylinder``: ends ``from`` and ``to``, ``radius``, radius ``round`` of the edges
     - ``ring``: center ``at``, axis z, ``radius``, radius ``thick`` of the tube
 
-    Any part may have a ``rotation`` about ``at``, ``cut`` (subtract it), its own ``blend``, ``mirror`` ("x" or "y": add
-    a mirrored copy) and ``color``.
+    Any part may also have these fields: a ``rotation`` about ``at``; ``cut`` to subtract the part; its own ``blend``;
+    ``mirror`` ("x" or "y") to add a mirrored copy; and a ``color``.
 
     Args:
         parts: data of the primitives.
@@ -252,7 +259,10 @@ def solid(parts: list[dict[str, Any]], blend: float = 0.03, detail: int = 96) ->
 
 
 def _sampled(parts: list[dict[str, Any]], blend: float, low: Array, high: Array, step: float) -> Array:
-    """Sample distances on a grid with a margin of two cells: exact near the surface, coarse elsewhere."""
+    """Sample signed distances on a grid with a margin of two cells.
+
+    Distances are exact near the surface, and coarse far from it.
+    """
     counts = np.ceil((np.ceil((high - low) / step) + 5) / COARSE).astype(int) + 1
     coarse = np.stack(np.meshgrid(*(np.arange(n) * COARSE for n in counts), indexing="ij"), -1)
     values = _distance(low + step * (coarse - 2.0), parts, blend)
@@ -264,7 +274,7 @@ def _sampled(parts: list[dict[str, Any]], blend: float, low: Array, high: Array,
 
 
 def _mirrored(part: dict[str, Any]) -> dict[str, Any]:
-    """Return the data of the mirrored copy of a part."""
+    """Return the data of a part that is mirrored as its field ``mirror`` requests."""
     axis = "xy".index(part["mirror"])
     copy = dict(part)
     for name in {"at", "from", "to", "rotation"} & set(part):
@@ -274,7 +284,7 @@ def _mirrored(part: dict[str, Any]) -> dict[str, Any]:
 
 
 def _bounds(parts: list[dict[str, Any]]) -> tuple[Array, Array]:
-    """Return the smallest and largest corner of a box around the parts that are not cut."""
+    """Return the smallest and largest corner of a box around all parts, without those that are subtracted."""
     corners = []
     for part in (part for part in parts if not part.get("cut")):
         if "from" in part:
@@ -289,13 +299,14 @@ def _bounds(parts: list[dict[str, Any]]) -> tuple[Array, Array]:
 
 
 def _distance(points: Array, parts: list[dict[str, Any]], blend: float, block: float = 0.0) -> Array:
-    """Compute the signed distance [...] of points [..., 3] to all parts.
+    """Compute the signed distances [...] from points [..., 3] to the union of all parts.
 
     Args:
-        points: the points; [N, 3] with ``block``.
+        points: the points. Their shape is [N, 3] if ``block`` is not 0.
         parts: data of the primitives.
         blend: width of the blend.
-        block: side of blocks of points. A block is evaluated with the parts near it only. 0: one block.
+        block: width of blocks of points. To save time, a block is only compared with the parts near it. If 0, all
+            points are compared with all parts.
     """
     if block <= 0 or len(parts) < FEW:
         return _combined(points, parts, blend)
@@ -317,7 +328,7 @@ def _distance(points: Array, parts: list[dict[str, Any]], blend: float, block: f
 
 
 def _combined(points: Array, parts: list[dict[str, Any]], blend: float) -> Array:
-    """Blend the signed distances [...] of points [..., 3] to parts.
+    """Compute the signed distances [...] from points [..., 3] to each part, and combine them.
 
     Raises:
         ValueError: parts are missing.
@@ -340,7 +351,7 @@ def _smooth_minimum(a: Array, b: Array, width: float) -> Array:
 
 
 def _gradient(points: Array, parts: list[dict[str, Any]], blend: float, step: float, block: float) -> Array:
-    """Compute the gradient [N, 3] of the distance by central differences over ``step`` each way."""
+    """Compute the gradients [N, 3] of the distance by central differences, with points at distance ``step``."""
     slopes = []
     for offset in np.eye(3) * step:
         ahead, behind = (_distance(points + side * offset, parts, blend, block) for side in (1, -1))
@@ -349,7 +360,7 @@ def _gradient(points: Array, parts: list[dict[str, Any]], blend: float, step: fl
 
 
 def _colored(mesh: Mesh, parts: list[dict[str, Any]]) -> Mesh:
-    """Assign each triangle the color of the colored part nearest to its center.
+    """Give each triangle the color of the part that is nearest to its center and has a color.
 
     Vertices between two colors are duplicated. Texture coordinates select a color of the palette.
     """

@@ -1,4 +1,4 @@
-"""Rendering of scene folders with ground truth, and of sweeps over a parameter."""
+"""Render scene folders with ground truth, for one scene or for a series of values of a parameter."""
 
 from __future__ import annotations
 
@@ -42,30 +42,30 @@ from polarguide_synth.settings import LONG_SECONDS, Overrides, SynthSettings, ch
 from polarguide_synth.transport import PathLimits
 
 TEST_SAMPLES = 4
-"""Factor on the samples of held-out views."""
+"""Ratio of the samples per pixel in held-out views to those in training views."""
 METER_VIEWS = 4
-"""Largest number of views that are metered."""
+"""Largest number of views from which the exposure is measured."""
 METER_SAMPLES = 16
-"""Samples per pixel of metered views."""
+"""Samples per pixel of the views from which the exposure is measured."""
 METER_WIDTH = 64
-"""Approximate width of metered views in pixels."""
+"""Approximate width in pixels of the views from which the exposure is measured."""
 BRIGHT = 1.5
-"""S0 that 1 % of the pixels exceed, three quarters of full scale."""
+"""Value of S0 that 1 % of the pixels exceed at automatic exposure. It is three quarters of full scale."""
 
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """A planned rendering. Nothing is loaded or written yet."""
+    """A rendering that is planned. Creating a plan neither loads nor writes anything."""
 
     spec: SceneSpec
     settings: SynthSettings
     out: Path
 
     def checked_state(self) -> folder.State:
-        """Return the state of the rendering in the folder.
+        """Return how far the rendering in the folder has progressed.
 
         Raises:
-            PolarguideError: a setting is invalid, or the folder holds other files.
+            PolarguideError: a setting is invalid, or the folder contains other files.
         """
         self.settings.check()
         require_unicode(self.out)
@@ -80,11 +80,11 @@ class Plan:
 
     @cached_property
     def tests(self) -> list[str]:
-        """Names of the held-out views; empty for a single view."""
+        """Names of the held-out views. Empty if there is only one view."""
         return self.names[:: self.settings.test_every] if len(self.names) > 1 else []
 
     def unfinished(self) -> list[int]:
-        """Return the numbers of the views that are not finished."""
+        """Return the numbers of the views that are not finished yet."""
         return [
             number
             for number, name in enumerate(self.names)
@@ -92,28 +92,28 @@ class Plan:
         ]
 
     def paths_left(self) -> int:
-        """Return the number of paths of the unfinished views."""
+        """Return the number of light paths that the unfinished views need."""
         views = sum(TEST_SAMPLES if self.names[number] in self.tests else 1 for number in self.unfinished())
         return self.settings.width * self.settings.height * self.settings.samples * views
 
     @property
     def mosaics(self) -> bool:
-        """True if raw mosaics are written."""
+        """True if the rendering also writes raw mosaics."""
         return self.settings.sensor in SENSORS
 
     def photograph(self, number: int) -> tuple[FilterShot, Path] | None:
-        """Return the photograph of a view through a filter, and its file; None for other sensors."""
+        """Return the photograph of a view through a filter, and its file. Return None for other sensors."""
         if self.settings.sensor != "filter":
             return None
         shot = plan_shot(self.settings.seed, number)
         return shot, self.out / "raw" / f"{self.names[number]}_a{shot.body_angle}.jpg"
 
     def has_ground_truth(self, name: str) -> bool:
-        """Return True if ground truth of a view is written."""
+        """Return True if the ground truth of a view is written."""
         return self.settings.ground_truth == "all" or name in self.tests
 
     def files(self, name: str) -> list[Path]:
-        """Return the files of a view."""
+        """Return the paths of all files of a view."""
         files = folder.view_files(self.out, name, ground_truth=self.has_ground_truth(name), raw=self.mosaics)
         photograph = self.photograph(self.names.index(name))
         return files if photograph is None else [*files, photograph[1]]
@@ -121,12 +121,12 @@ class Plan:
 
 @dataclass(frozen=True, eq=False)
 class Job(Plan):
-    """A rendering with the scene in memory.
+    """A rendering whose scene is in memory.
 
     Attributes:
         built: scene of Mitsuba.
         cameras: cameras of the views.
-        exposure: values of the pictures per radiance.
+        exposure: factor from radiance to the values of the pictures.
         sensor: parameters of the simulated sensor.
     """
 
@@ -137,7 +137,7 @@ class Job(Plan):
 
 
 def expected_time(plans: Sequence[Plan], reporter: Reporter, *, threads: int = 0) -> float:
-    """Estimate the time that the unfinished views of scenes take, in seconds. Nothing is written.
+    """Estimate the time in seconds to render the unfinished views of scenes. Nothing is written.
 
     Args:
         plans: the scenes.
@@ -145,7 +145,7 @@ def expected_time(plans: Sequence[Plan], reporter: Reporter, *, threads: int = 0
         threads: number of threads; 0 uses all cores.
 
     Raises:
-        PolarguideError: as ``synthesize``.
+        PolarguideError: for the same reasons as in ``synthesize``.
     """
     unfinished = [plan for plan in plans if plan.checked_state() != "finished"]
     if not unfinished:
@@ -177,7 +177,7 @@ def synthesize(
         The folder.
 
     Raises:
-        PolarguideError: Mitsuba is missing, the folder holds other files, or the scene is invalid.
+        PolarguideError: Mitsuba is missing, the folder contains other files, or the scene is invalid.
     """
     plan = Plan(spec, settings, out)
     state = plan.checked_state()
@@ -267,7 +267,7 @@ def render_view(job: Job, number: int) -> None:
                 stokes, camera.rays(dtype=torch.float64).numpy(), shot, settings.noise, random, job.sensor
             ),
         )
-    # The files of a simulated sensor have the noise. These pictures are their noise-free reference.
+    # Only the files of a simulated sensor contain noise. These pictures are their noise-free reference.
     noise = settings.noise if settings.sensor == "ideal" else 0.0
     write_view(
         job.out, name, folder.sensor_codes(stokes, lambda values: noisy(values, noise, random, job.sensor))
@@ -282,11 +282,12 @@ def write_sparse(
     out: Path,
     settings: SynthSettings,
 ) -> None:
-    """Write the COLMAP model of rendered views, and the split into training and test views.
+    """Write the COLMAP model of rendered views, and the split into training and held-out views.
 
     Args:
         built: the scene.
-        cameras, names: cameras and names of the views.
+        cameras: cameras of the views.
+        names: names of the views.
         tests: names of the held-out views.
         out: scene folder.
         settings: number and seed of the points.
@@ -299,7 +300,7 @@ def write_sparse(
 
 
 def _metered_exposure(built: BuiltScene, cameras: list[Camera], seed: int) -> float:
-    """Return the exposure at which 1 % of S0 in some small pictures lies above ``BRIGHT``."""
+    """Return the exposure at which 1 % of the pixels exceed ``BRIGHT``, measured in some small pictures."""
     values = []
     for camera in cameras[:: -(-len(cameras) // METER_VIEWS)]:
         factor = max(1, camera.width // METER_WIDTH)
@@ -310,25 +311,25 @@ def _metered_exposure(built: BuiltScene, cameras: list[Camera], seed: int) -> fl
 
 
 def _halved(values: Array) -> Array:
-    """Average boxes of 2x2 pixels: [..., 2H, 2W, 3] to [..., H, W, 3]."""
+    """Average blocks of 2x2 pixels: an array [..., 2H, 2W, 3] becomes [..., H, W, 3]."""
     *lead, height, width, colors = values.shape
     return np.asarray(values.reshape(*lead, height // 2, 2, width // 2, 2, colors).mean(axis=(-4, -2)))
 
 
 PARAMETERS = ("views", "noise", "roughness", "index", "spacing")
-"""Parameters of sweeps."""
+"""Parameters that a sweep can vary."""
 
 
 @dataclass(frozen=True)
 class Sweep:
-    """A parameter and its values, in ascending order."""
+    """A parameter that is varied between scenes, and its values in ascending order."""
 
     parameter: str
     values: tuple[float, ...]
 
 
 def parse_sweep(text: str) -> Sweep:
-    """Parse a sweep such as ``noise=0,1,2``.
+    """Parse a parameter and its values, such as ``noise=0,1,2``.
 
     Raises:
         PolarguideError: the parameter is unknown, or a value is invalid.
@@ -350,24 +351,26 @@ def sweep_scenes(
     spec: SceneSpec, out: Path, settings: SynthSettings, overrides: Overrides, sweep: Sweep, reporter: Reporter, *,
     threads: int = 0,
 ) -> list[Path]:  # fmt: skip
-    """Write ``out/<parameter>-<value>`` for every value, such as ``views-06`` and ``views-12``.
+    """Render one scene for each value of a parameter, into folders such as ``views-06`` and ``views-12``.
 
-    A sweep over ``views``, their number in training, renders the scene once and removes training views evenly for the
-    smaller scenes. All members share their test views and the files of their pictures.
+    The parameter ``views`` is the number of training views. For this parameter, the scene is rendered only once, and
+    smaller scenes leave out training views evenly. All scenes share their held-out views and the files of their
+    pictures.
 
     Args:
         spec: the scene.
-        out: folder of the members.
-        settings, overrides: settings of the rendering, and changes to the scene.
+        out: folder that contains the folders of the scenes.
+        settings: settings of the rendering.
+        overrides: changes to the scene.
         sweep: the parameter and its values.
         reporter: receiver of progress and messages.
         threads: number of threads; 0 uses all cores.
 
     Returns:
-        The folders of the members, in the order of the values.
+        The folders of the scenes, in the order of the values.
 
     Raises:
-        PolarguideError: as ``synthesize``, or the scene has too few views.
+        PolarguideError: for the same reasons as in ``synthesize``, or because the scene has too few views.
     """
     plans = sweep_plans(spec, out, settings, overrides, sweep)
     if sweep.parameter == "views":
@@ -382,7 +385,10 @@ def sweep_scenes(
 def sweep_plans(
     spec: SceneSpec, out: Path, settings: SynthSettings, overrides: Overrides, sweep: Sweep
 ) -> list[Plan]:
-    """Return the plans of a sweep, in the order of its values; one plan for all views of a sweep over ``views``."""
+    """Return one plan for each value of a sweep, in their order.
+
+    For the parameter ``views``, return a single plan that contains all views.
+    """
     if sweep.parameter == "views":
         return [Plan(overrides.apply(spec), settings, out / "all")]
     plans = []
@@ -397,20 +403,20 @@ def sweep_plans(
 
 
 def _member(out: Path, sweep: Sweep, value: float) -> Path:
-    """Return the folder of a value, with leading zeros for sorting: views-06, views-12."""
+    """Return the folder of a value, such as views-06. Leading zeros make the names sortable."""
     digits = max(len(str(int(other))) for other in sweep.values)
     whole, *rest = f"{value:g}".split(".")
     return out / f"{sweep.parameter}-{'.'.join([whole.zfill(digits), *rest])}"
 
 
 def _write_record(scene: Path, record: dict[str, Any], parameter: str, value: float) -> None:
-    """Write ``scene.json`` with the parameter of a sweep."""
+    """Write ``scene.json`` with the parameter and the value of a sweep."""
     record = {**record, "study": {"parameter": parameter, "value": value}}
     folder.write_file(scene / "scene.json", json.dumps(record, indent=1).encode())
 
 
 def _fewer_views(plan: Plan, out: Path, sweep: Sweep, reporter: Reporter, threads: int) -> list[Path]:
-    """Write the members of a sweep over the number of training views, from the scene with all views."""
+    """Write the scenes of a sweep over the number of training views, from the scene with all views."""
     spec = plan.spec
     settings = plan.settings
     cameras = place_cameras(spec.camera, settings.width, settings.height, settings.seed)
@@ -444,7 +450,7 @@ def _fewer_views(plan: Plan, out: Path, sweep: Sweep, reporter: Reporter, thread
 
 
 def _link(scene: Path, member: Path, names: list[str]) -> None:
-    """Share the files of views between two scenes, by hard links if the disk supports them."""
+    """Share the files of some views between two scenes, by hard links if the disk supports them."""
     for name in names:
         for source in folder.view_files(scene, name, ground_truth=True, raw=True):
             target = member / source.relative_to(scene)

@@ -1,4 +1,4 @@
-"""The data of a scene, and the validation of scene files in JSON.
+"""Data types of a scene, and validation of scene files in JSON.
 
 docs/reference/scene-files.md describes the fields. Lengths are in one unit of the author's choice, z is up, colors are
 linear sRGB in [0, 1], radiance is linear and unbounded, angles are degrees.
@@ -23,15 +23,15 @@ REMEDY = "docs/reference/scene-files.md describes the fields."
 LARGEST = 1e6
 """Largest number in a scene. Single precision is too coarse for larger lengths."""
 LONGEST = 1000
-"""Largest length of a list such as the points of a path or the parts of a solid."""
+"""Largest number of elements in a list, such as the points of a path or the parts of a solid."""
 FINEST = {"detail": 512, "segments": 512, "smooth": 64}
-"""Upper bounds of the fields that determine the number of triangles."""
+"""Largest values of the fields that determine the number of triangles."""
 LONGEST_NAME = 100
-"""Largest length of an object's name."""
+"""Largest number of characters in an object's name."""
 
 
 def check_numbers(data: Any, where: str, field: str) -> None:
-    """Validate numbers and lists in data of a shape, a texture, a light or an environment.
+    """Validate the numbers and the lengths of lists in the data of a shape, a texture, a light or an environment.
 
     Args:
         data: the data.
@@ -69,7 +69,7 @@ def check_file_name(name: str, where: str) -> None:
 
 
 def require_unicode(path: Path) -> None:
-    """Validate the encoding of a file name. The renderer ends the process if the name is not UTF-8.
+    """Check that a file name is UTF-8. Otherwise the renderer would end the process.
 
     Raises:
         PolarguideError: the name is not UTF-8.
@@ -83,7 +83,9 @@ def require_unicode(path: Path) -> None:
 
 
 def check_color(color: Any, where: str) -> None:
-    """Validate a color: three numbers from 0 to 1, "own", or a texture, which ``textures.make_texture`` validates.
+    """Validate a color: three numbers from 0 to 1, "own", or a texture.
+
+    The data of a texture is validated later by ``textures.make_texture``.
 
     Raises:
         PolarguideError: the value is not a color.
@@ -98,7 +100,7 @@ def check_color(color: Any, where: str) -> None:
 
 
 def require_light(panorama: NDArray[Any], where: str) -> None:
-    """Validate an environment [H, W, 3].
+    """Validate the panorama [H, W, 3] of an environment light.
 
     Raises:
         PolarguideError: a value is negative or not finite, or the shape is wrong.
@@ -111,7 +113,7 @@ def require_solid(points: NDArray[Any], where: str) -> None:
     """Validate the vertices [V, 3] of an object.
 
     Raises:
-        PolarguideError: the vertices are not finite, or all at one position.
+        PolarguideError: a vertex is not finite, or all vertices are at one position.
     """
     if not (len(points) and np.isfinite(points).all() and np.ptp(points, axis=0).max() > 0):
         raise _fault(f"{where} shape", "an object with an extent", "no extent, or one that is not finite")
@@ -125,7 +127,7 @@ T = TypeVar("T")
 
 
 def make(makers: Mapping[str, Callable[..., T]], data: Mapping[str, Any], where: str, expected: str) -> T:
-    """Call the function of the type in ``data`` with the other fields as arguments.
+    """Select a function by the type in ``data``, and call it with the remaining fields as arguments.
 
     Args:
         makers: functions by type.
@@ -154,31 +156,32 @@ Refraction = Annotated[float, Meta(gt=0, le=100)]
 Extinction = Annotated[float, Meta(ge=0, le=100)]
 Data = dict[str, Any]
 OLD_KEYS = {"colour": "color", "colours": "colors", "towards": "toward", "truth": "ground_truth"}
-"""Current names of fields by their names in earlier scene files and requests."""
+"""Current names of fields, by their names in scene files and requests of earlier versions."""
 
 
 class Ball(Struct, frozen=True, forbid_unknown_fields=True, tag_field="type", tag="ball"):
-    """A sphere of Mitsuba, without triangles."""
+    """A perfect sphere, which Mitsuba renders without triangles."""
 
     radius: Annotated[float, Meta(gt=0, le=LARGEST)] = 1.0
 
 
 class MeshFile(Struct, frozen=True, forbid_unknown_fields=True, tag_field="type", tag="mesh"):
-    """The mesh of a PLY or OBJ file, whose name is relative to the folder of the scene file."""
+    """A mesh in a PLY or OBJ file. The file name is relative to the folder of the scene file."""
 
     file: str
 
 
 class Material(Struct, frozen=True, forbid_unknown_fields=True):
-    """A surface.
+    """Material of a surface.
 
     Attributes:
-        type: "plastic" (a dielectric coat over a diffuse base: glaze, paint, polished wood, dark glass, water),
-            "metal", or "matte" (depolarizing).
+        type: "plastic" is a dielectric coat over a diffuse base (glaze, paint, polished wood, dark glass, water).
+            "metal" is a metal. "matte" is a diffuse surface that depolarizes light.
         color: diffuse color, a texture (see ``textures``), or "own" for a shape with its own colors.
         roughness: GGX roughness of the coat or metal.
         index: refractive index of the coat.
-        eta, k: complex index of a metal for red, green and blue.
+        eta: real part of the refractive index of a metal for red, green and blue.
+        k: imaginary part of the refractive index of a metal for red, green and blue.
     """
 
     type: Literal["plastic", "metal", "matte"] = "plastic"
@@ -189,7 +192,7 @@ class Material(Struct, frozen=True, forbid_unknown_fields=True):
     k: tuple[Extinction, Extinction, Extinction] = (7.5, 6.4, 5.3)
 
     def record(self) -> Data:
-        """Return the record of the surface in ``scene.json``."""
+        """Return the description of the material for ``scene.json``."""
         fields = {
             "plastic": {"diffuse": self.color, "alpha": self.roughness, "ior": self.index},
             "metal": {"alpha": self.roughness, "eta": self.eta, "k": self.k},
@@ -199,14 +202,16 @@ class Material(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Thing(Struct, frozen=True, forbid_unknown_fields=True):
-    """An object.
+    """An object of a scene.
 
     Attributes:
         name: unique name.
         shape: data of the geometry (see ``build``).
         material: material of the surface.
-        foreground: the object is part of the mask.
-        position, rotation, scale: placement. The shape is scaled, rotated about x, then y, then z, and moved.
+        foreground: True if the object is part of the mask.
+        position: translation of the shape, applied last.
+        rotation: angles of the rotation about x, then y, then z, applied after the scale.
+        scale: scale factor of the shape, applied first.
     """
 
     name: str
@@ -219,7 +224,7 @@ class Thing(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Ring(Struct, frozen=True, rename={"start": "from", "stop": "to"}):
-    """A ring of cameras: radius, height over the ground, share of the views, and the arc in degrees about z."""
+    """A ring of cameras: radius, height above the ground, share of the views, and the arc in degrees about z."""
 
     radius: Annotated[float, Meta(gt=0, le=LARGEST)]
     height: Number
@@ -242,15 +247,16 @@ class Light(Struct, frozen=True):
 
 
 class CameraPath(Struct, frozen=True, forbid_unknown_fields=True):
-    """Positions of the cameras: rings about the target, or arcs of rings.
+    """Positions of the cameras, which are on rings about the target or on arcs of rings.
 
     Attributes:
         rings: data of the rings, see ``Ring``.
         target: point that the cameras face.
-        wander: largest random offset of a camera's target from ``target``.
+        wander: largest random distance between ``target`` and the point that a camera faces.
         fov: horizontal field of view in degrees.
         views: number of views.
-        spacing: degrees between neighbors on a ring, about the middle of its arc; None fills the arc evenly.
+        spacing: angle in degrees between two neighboring cameras on a ring, around the middle of its arc. If None, the
+            cameras fill the arc evenly.
     """
 
     rings: Annotated[tuple[Data, ...], Meta(min_length=1)]
@@ -262,19 +268,20 @@ class CameraPath(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class SceneSpec(Struct, frozen=True, forbid_unknown_fields=True):
-    """A scene.
+    """Complete description of a scene.
 
     Attributes:
-        name, about: name and description.
+        name: name of the scene.
+        about: description for users.
         camera: positions of the cameras.
         things: objects.
         environment: data of the environment light (see ``textures``).
         lights: data of the area lights, see ``Light``.
         depth: largest number of surfaces on a light path.
-        clamp: see ``transport.PathLimits``.
-        exposure: display value of radiance 1; None meters it until 1 % of S0 lies above 1.5.
-        object_only: show only objects of the foreground. Other objects are black to the camera, but still illuminate,
-            are reflected and occlude.
+        clamp: largest radiance of a path, see ``transport.PathLimits``.
+        exposure: factor from radiance to display values. If None, it is chosen so that 1 % of S0 exceeds 1.5.
+        object_only: True to show only objects of the foreground. All other objects are black to the camera, but still
+            illuminate, are reflected and occlude.
         folder: folder that file names of meshes and pictures are relative to.
     """
 
@@ -292,7 +299,7 @@ class SceneSpec(Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def visible(self) -> tuple[bool, ...]:
-        """Visibility of the objects to the camera."""
+        """True for each object that the camera sees, in the order of the objects."""
         return tuple(thing.foreground or not self.object_only for thing in self.things)
 
     def data(self) -> Data:
@@ -308,7 +315,7 @@ def read_scene_file(path: Path) -> SceneSpec:
     """Read a scene file.
 
     Raises:
-        PolarguideError: the file cannot be read, lacks a field, or has an unknown field or a value out of range.
+        PolarguideError: the file cannot be read, lacks a field, has an unknown field, or has a value out of range.
     """
     return parse_scene(read_record(path, Data, remedy=REMEDY), str(path), folder=path.parent)
 
@@ -322,7 +329,7 @@ def parse_scene(data: Any, where: str, *, folder: Path) -> SceneSpec:
         folder: folder that file names are relative to.
 
     Raises:
-        PolarguideError: the scene lacks a field, or has an unknown field or a value out of range.
+        PolarguideError: the scene lacks a field, has an unknown field, or has a value out of range.
     """
     spec = decode(with_current_keys(data), SceneSpec, where, remedy=REMEDY)
     for number, ring in enumerate(spec.camera.rings):
@@ -343,7 +350,7 @@ def parse_scene(data: Any, where: str, *, folder: Path) -> SceneSpec:
 
 
 def with_current_keys(data: Any) -> Any:
-    """Return JSON data with the current names of fields."""
+    """Replace the names of fields in earlier versions by their current names in JSON data."""
     if isinstance(data, dict):
         return {OLD_KEYS.get(key, key): with_current_keys(value) for key, value in data.items()}
     return [with_current_keys(value) for value in data] if isinstance(data, list) else data

@@ -1,4 +1,4 @@
-"""A simulated camera: Stokes vectors of its pixels, raw mosaics of a polarization sensor, and shots through a filter.
+"""Simulate a camera: Stokes vectors of its pixels, raw mosaics of a polarization sensor, and shots through a filter.
 
 Full well, read noise and extinction ratio are close to those of Sony's IMX250MYR. Photon noise has a Poisson
 distribution, read noise a normal distribution (EMVA 1288).
@@ -60,8 +60,9 @@ def noisy(intensity: Array, noise: float, random: np.random.Generator, sensor: S
     """Add photon and read noise to intensities.
 
     Args:
-        intensity: linear intensities of any shape, 1 is full scale.
-        noise: 1 for exposure to the full well, 2 for a quarter of that light, 0 for no noise.
+        intensity: linear intensities of any shape. 1 is full scale.
+        noise: amount of noise. 1 simulates an exposure to the full well, 2 an exposure with a quarter of that light, 0
+            no noise.
         random: generator of random numbers.
         sensor: full well and read noise.
     """
@@ -82,9 +83,11 @@ def mosaic(
     An extinction ratio E scales S1 and S2 by (E - 1) / (E + 1). A monochrome sensor measures the mean of the colors.
 
     Args:
-        stokes: [3, H, W, 3], full scale 1.
+        stokes: Stokes vectors [3, H, W, 3], full scale 1.
         name: name of the sensor.
-        noise, random, sensor: as for ``noisy``.
+        noise: amount of noise, as for ``noisy``.
+        random: generator of random numbers.
+        sensor: parameters of the sensor.
     """
     pattern = sensor_pattern(name)
     angles = tiled(pattern.angles, stokes.shape[1:3])
@@ -101,9 +104,9 @@ def mosaic(
 
 
 STOPS = 0.3
-"""Largest deviation of the automatic exposure from the mean, in stops."""
+"""Largest deviation of the simulated automatic exposure from its mean, in stops."""
 STEP = 15
-"""Degrees between the marks of the filter's ring."""
+"""Degrees between two marks on the ring of the filter. Simulated angles are multiples of it."""
 QUALITY = 95
 """JPEG quality of shots through a filter."""
 _TIME = Fraction(1, 60)
@@ -112,13 +115,13 @@ _TURNS = (1, 1, 1, 6, 8, 3)
 
 @dataclass(frozen=True)
 class FilterShot:
-    """A simulated photograph of a view through a filter.
+    """Settings of a simulated photograph of a view through a filter.
 
     Attributes:
         angle: transmission axis of the filter, degrees counter-clockwise from the horizontal of the displayed picture.
-        stops: exposure relative to the mean exposure, in stops; 1 is twice the light.
+        stops: exposure relative to the mean exposure, in stops. 1 is twice the light.
         orientation: EXIF orientation of the stored picture, 1, 3, 6 or 8.
-        noted: True if the file records the exposure time.
+        noted: True if the file states the exposure time.
     """
 
     angle: float
@@ -128,12 +131,12 @@ class FilterShot:
 
     @property
     def body_angle(self) -> int:
-        """Angle relative to the camera body (the rows of the stored picture), 0 to 179 degrees."""
+        """Angle of the filter relative to the camera body (the rows of the stored picture), 0 to 179 degrees."""
         return round(self.angle - orientation_calibration(self.orientation).zero) % 180
 
 
 def plan_shot(seed: int, number: int) -> FilterShot:
-    """Return the angle, exposure and orientation of the photograph of view ``number``."""
+    """Choose the angle, exposure and orientation of the photograph of view ``number`` at random."""
     random = np.random.default_rng((seed, 47, number))
     return FilterShot(
         STEP * int(random.integers(0, 180 // STEP)),
@@ -143,14 +146,14 @@ def plan_shot(seed: int, number: int) -> FilterShot:
 
 
 def behind_filter(stokes: Array, rays: Array, degrees: float) -> Array:
-    """Return the intensities [H, W, 3] behind an ideal polarizing sheet before the lens.
+    """Return the intensities [H, W, 3] behind an ideal polarizing sheet in front of the lens.
 
     The sheet absorbs along an axis ``c`` in the plane of the picture. A ray ``d`` keeps the field perpendicular to
     ``d`` and ``c``. The angle of this field in the lens frame of the ray differs from pixel to pixel.
 
     Args:
-        stokes: [3, H, W, 3] in the lens frame.
-        rays: [H, W, 3] unit vectors, camera axes.
+        stokes: Stokes vectors [3, H, W, 3] in the lens frame.
+        rays: unit vectors [H, W, 3] in camera axes.
         degrees: transmission axis of the filter, counter-clockwise as displayed.
     """
     angle = np.radians(degrees)
@@ -166,13 +169,17 @@ def behind_filter(stokes: Array, rays: Array, degrees: float) -> Array:
 def filter_jpeg(
     stokes: Array, rays: Array, shot: FilterShot, noise: float, random: np.random.Generator, sensor: Sensor
 ) -> bytes:
-    """Return the JPEG file that a camera stores of a view: noise, sRGB, 8 bits, rotated like the camera.
+    """Return the JPEG file that a camera would store, with noise, sRGB encoding and 8 bits.
+
+    The picture is rotated like the camera.
 
     Args:
-        stokes: [3, H, W, 3] of the upright picture, full scale 1, in the lens frame.
-        rays: [H, W, 3] unit vectors of the upright picture.
+        stokes: Stokes vectors [3, H, W, 3] of the upright picture in the lens frame, full scale 1.
+        rays: unit vectors [H, W, 3] of the upright picture.
         shot: angle, exposure and orientation.
-        noise, random, sensor: as for ``noisy``.
+        noise: amount of noise, as for ``noisy``.
+        random: generator of random numbers.
+        sensor: parameters of the sensor.
     """
     light = behind_filter(stokes, rays, shot.angle) * 2.0**shot.stops
     encoded = srgb_encode_array(np.clip(noisy(light, noise, random, sensor), 0.0, 1.0))
@@ -188,7 +195,10 @@ def filter_jpeg(
 
 
 def exif_tags(orientation: int, time: Fraction | None) -> bytes:
-    """Return a TIFF structure with the orientation and, if a time is given, exposure time, f-number and ISO speed."""
+    """Return the EXIF data of a picture, with its orientation.
+
+    If a time is given, the data also contains exposure time, f-number and ISO speed.
+    """
     if time is None:
         return b"MM\0*" + struct.pack(">IHHHIHHI", 8, 1, 274, 3, 1, orientation, 0, 0)
     head = b"MM\0*" + struct.pack(">I", 8)
@@ -199,19 +209,19 @@ def exif_tags(orientation: int, time: Fraction | None) -> bytes:
 
 
 PATHS_AT_ONCE = 1 << 20
-"""Batch size in paths, which limits memory and the delay of Ctrl-C."""
+"""Batch size in paths. It limits memory, and the delay after Ctrl-C."""
 SCATTER = 0x9E3779B1
-"""Factor that spreads the seeds of views."""
+"""Multiplier that makes the seeds of successive views very different."""
 
 
 @dataclass(frozen=True, eq=False)
 class LobeRadiance:
-    """Radiance at the pixels of a camera, in units of S0.
+    """Radiance at the pixels of a camera in units of S0, separated by the lobes of the first surface.
 
     Attributes:
-        specular, diffuse: Stokes vectors of the two lobes of the first surface in the lens frame of each ray,
-            [3, H, W, 3] float64.
-        emitted: radiance of directly visible light sources and environment, [H, W, 3] float64.
+        specular: [3, H, W, 3] float64, Stokes vectors of the specular lobe in the lens frame of each ray.
+        diffuse: [3, H, W, 3] float64, Stokes vectors of the diffuse lobe in the lens frame of each ray.
+        emitted: [H, W, 3] float64, radiance of directly visible light sources and environment.
     """
 
     specular: NDArray[np.float64]
@@ -220,7 +230,7 @@ class LobeRadiance:
 
     @property
     def stokes(self) -> NDArray[np.float64]:
-        """Stokes vectors of the picture, [3, H, W, 3]."""
+        """Stokes vectors of the whole picture, [3, H, W, 3]."""
         total = self.specular + self.diffuse
         total[0] += self.emitted
         return total
@@ -235,16 +245,16 @@ def render_lobes(
     limits: PathLimits,
     center: bool = False,
 ) -> LobeRadiance:
-    """Render a view.
+    """Render the radiance of a view, separated by the lobes of the first surface.
 
     Args:
-        scenes: one Mitsuba scene of a spectral variant, or three of a mono variant for red, green and blue. The
-            channels share their random numbers: the noise has no color.
-        camera: pose and intrinsics; the reconstruction filter is a box of one pixel.
+        scenes: one Mitsuba scene of a spectral variant, or three of a mono variant for red, green and blue. The three
+            channels share their random numbers, so the noise has no color.
+        camera: pose and intrinsics. The reconstruction filter is a box of one pixel.
         samples: paths per pixel and lobe.
         seed: seed of the view.
         limits: limits of the paths.
-        center: send all rays through the centers of pixels.
+        center: True to send all rays through the centers of pixels.
     """
     pixels = camera.width * camera.height
     passes = min(samples, -(-samples * pixels // PATHS_AT_ONCE))
@@ -266,7 +276,10 @@ def render_lobes(
 def _render_pass(
     scene: Any, camera: Camera, part: tuple[int, int], seed: int, limits: PathLimits, center: bool
 ) -> NDArray[np.float64]:
-    """Sum the samples of each pixel in ``part``, first sample and count: [pixels, 7, 3 or 1]."""
+    """Sum the samples of each pixel, [pixels, 7, 3 or 1].
+
+    ``part`` contains the number of the first sample, and the number of samples.
+    """
     pixels = camera.width * camera.height
     first, count = part
     lens = pinhole(camera)
@@ -285,7 +298,10 @@ def _render_pass(
 
 @functools.cache
 def _compiled() -> Callable[..., list[Any]]:
-    """Return ``_sums`` traced once per scene and picture size, because tracing takes as long as 100,000 paths."""
+    """Return a version of ``_sums`` that is traced only once per scene and picture size.
+
+    Tracing takes as long as 100,000 paths.
+    """
     return dr.freeze(_sums, warn_after=1 << 30)
 
 
@@ -299,7 +315,7 @@ def _sums(
     limits: PathLimits,
     center: bool,
 ) -> list[Any]:
-    """Sum ``count`` samples of each pixel in one batch."""
+    """Trace ``count`` samples of each pixel in one batch, and return their sums."""
     first, per_pixel = part
     index = dr.arange(mi.UInt32, pixels * count)
     pixel = index // per_pixel
@@ -312,7 +328,11 @@ def _sums(
 def _path(
     scene: Any, lens: list[Any], pixel: Any, sample: Any, seed: Any, limits: PathLimits, center: bool
 ) -> list[list[Any]]:
-    """Trace one sample in color: S0, S1, S2 of the specular and the diffuse lobe, and directly visible emission."""
+    """Trace one sample of a pixel in color.
+
+    Returns:
+        S0, S1 and S2 of the specular lobe and of the diffuse lobe; and directly visible emission.
+    """
     sampler = Sampler(mi.UInt32(pixel), mi.UInt32(sample), seed)
     spread = sampler.next()
     place = sampler.pair()
@@ -331,6 +351,6 @@ def _path(
 
 
 def _shifted(sample: Any) -> Any:
-    """Return four equally spaced numbers modulo 1, one for each wavelength of a ray."""
+    """Return four equally spaced numbers modulo 1, from which the wavelengths of a ray are sampled."""
     values = (sample + k / 4 for k in range(4))
     return mi.UnpolarizedSpectrum(*(dr.select(value >= 1.0, value - 1.0, value) for value in values))

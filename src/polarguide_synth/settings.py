@@ -1,4 +1,4 @@
-"""Settings of the rendering, changes to a scene, and the choice of Mitsuba's variant."""
+"""Settings of a rendering, changes to a scene, and the choice of Mitsuba's variant."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ Color = Literal["rgb", "spectral"]
 OLDEST_LLVM = 16
 """Oldest supported version of LLVM. Earlier versions crash on newer processors."""
 SLOW_PATHS_PER_SECOND = 800.0
-"""Approximate speed of the scalar variant, which has no threads."""
+"""Approximate number of paths per second of the scalar variant, which uses one thread."""
 FAST_PATHS_PER_SECOND = 200_000.0
-"""Approximate speed of each thread of a compiled variant."""
+"""Approximate number of paths per second and thread of a compiled variant."""
 LONG_SECONDS = 3600.0
-"""Duration of a rendering above which the user has to confirm it."""
+"""Estimated duration of a rendering above which the user has to confirm it."""
 
 
 class _Library:
-    """A library of the extra ``synth``, imported on first use because it may be missing."""
+    """Placeholder for a library of the extra ``synth``, which is imported on first use because it may be missing."""
 
     def __init__(self, module: str) -> None:
         self._module = module
@@ -46,14 +46,14 @@ mi: Any = _Library("mitsuba")
 
 @dataclass(frozen=True)
 class Variant:
-    """The current variant of Mitsuba.
+    """The variant of Mitsuba in use, which determines speed and representation of color.
 
     Attributes:
-        name: Mitsuba's name.
-        color: "rgb" renders three channels one after the other with exact values; "spectral" traces four wavelengths
+        name: Mitsuba's name of the variant.
+        color: "rgb" renders three channels one after the other with exact values. "spectral" traces four wavelengths
             per path and converts them.
         paths_per_second: approximate speed on this machine.
-        note: reason for a slow variant; empty for others.
+        note: reason why a slow variant is used. Empty for a fast variant.
     """
 
     name: str
@@ -63,10 +63,12 @@ class Variant:
 
 
 def choose_variant(color: Color = "rgb", *, threads: int = 0) -> Variant:
-    """Select a polarized variant: a compiled variant if the LLVM library can be loaded, else the scalar variant.
+    """Select a variant of Mitsuba that supports polarization.
+
+    It is a compiled variant if the LLVM library can be loaded, else the scalar variant.
 
     Args:
-        color: representation of color; the scalar variant supports "spectral" only.
+        color: representation of color. The scalar variant supports "spectral" only.
         threads: number of threads; 0 uses all cores.
 
     Raises:
@@ -104,7 +106,7 @@ def _silent_stderr() -> Iterator[None]:
 
 
 def missing_llvm() -> str:
-    """Return the reason why LLVM cannot be used; empty if it is available."""
+    """Return the reason why LLVM cannot be used. The text is empty if it can be used."""
     path = os.environ.get("DRJIT_LIBLLVM_PATH")
     if path and not os.path.exists(path):  # otherwise the library prints messages
         return f"DRJIT_LIBLLVM_PATH names {path}, which does not exist"
@@ -117,7 +119,7 @@ def missing_llvm() -> str:
 
 
 def rough_time(seconds: float) -> str:
-    """Format an estimated time."""
+    """Format an estimated duration."""
     hours = seconds / 3600
     return f"about {hours:.0f} hours" if hours >= 2 else f"about {max(2.0, hours * 60):.0f} minutes"
 
@@ -127,9 +129,9 @@ PRESETS = (
     *("metals-a", "metals-b", "ceramic-a", "ceramic-b", "rough", "lacquer"),
     *("glossy", "proof"),
 )
-"""Names of the presets."""
+"""Names of the scenes that are part of the package."""
 TEST_EVERY = 8
-"""Default interval of held-out views, as in reports of 3DGS."""
+"""Default interval of held-out views. 8 is common in reports of 3DGS."""
 
 
 @dataclass(frozen=True)

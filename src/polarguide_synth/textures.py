@@ -1,8 +1,8 @@
 """Procedural pictures in linear RGB: textures of surfaces, and panoramas of environment light.
 
-The data of a texture or an environment are ``{"type": "wood", ...}``. Each type is a function below, and the fields are
-its parameters. The type ``image`` reads a user's picture. A panorama is [H, W, 3] linear radiance. Its rows go from the
-zenith down, its columns clockwise as seen from above, from +x.
+A scene describes a texture or an environment by data such as ``{"type": "wood", ...}``. Each type is a function below,
+and the fields are its parameters. The type ``image`` reads a user's picture. A panorama is [H, W, 3] linear radiance.
+Its rows go from the zenith down, its columns clockwise as seen from above, from +x.
 """
 
 from __future__ import annotations
@@ -25,9 +25,10 @@ from polarguide_synth.schema import make
 
 
 def fractal_noise(points: Array, seed: int, octaves: int = 4) -> Array:
-    """Compute value noise in [0, 1] at points [..., D].
+    """Compute smooth random values in [0, 1] at points [..., D].
 
-    Scale and amplitude are halved from octave to octave. The first octave has unit cells.
+    The values are a sum of octaves. The first octave has cells of size 1, and each further octave has half the scale
+    and half the amplitude.
     """
     total = np.zeros(points.shape[:-1])
     for octave in range(octaves):
@@ -36,7 +37,10 @@ def fractal_noise(points: Array, seed: int, octaves: int = 4) -> Array:
 
 
 def _value(points: Array, seed: int) -> Array:
-    """Interpolate random numbers at lattice points by a quintic, whose second derivative is continuous."""
+    """Compute one octave of noise at points by interpolating random numbers at integer points.
+
+    The interpolation is a quintic, whose second derivative is continuous.
+    """
     cell = np.floor(points).astype(np.int64)
     t = points - cell
     t = t * t * t * (t * (6 * t - 15) + 10)
@@ -48,7 +52,7 @@ def _value(points: Array, seed: int) -> Array:
 
 
 def _hash(cell: np.ndarray, seed: int) -> Array:
-    """Hash lattice points [..., D] to numbers in [0, 1), by multiplications and xor shifts."""
+    """Hash integer points [..., D] to random numbers in [0, 1)."""
     value = np.full(cell.shape[:-1], (seed * 0x9E3779B9 + 0x7F4A7C15) & 0xFFFFFFFF, np.uint64)
     for k in range(cell.shape[-1]):
         value = (value ^ (cell[..., k].astype(np.uint64) & np.uint64(0xFFFFFFFF))) * np.uint64(
@@ -67,7 +71,7 @@ def wood(
     light: Color = (0.34, 0.19, 0.085), dark: Color = (0.13, 0.06, 0.025), planks: int = 5, seed: int = 0,
     pixels: int = 768,
 ) -> Array:  # fmt: skip
-    """Draw boards along u with grain and dark joints."""
+    """Draw wooden boards along u, with grain and dark joints."""
     u, v = _grid(pixels)
     board = np.floor(v * planks)
     inner = v * planks - board
@@ -99,7 +103,7 @@ def bricks(
     brick: Color = (0.30, 0.10, 0.06), mortar: Color = (0.38, 0.36, 0.33), rows: int = 16, columns: int = 8,
     joint: float = 0.07, seed: int = 0, pixels: int = 768,
 ) -> Array:  # fmt: skip
-    """Draw a running bond whose bricks differ in tone."""
+    """Draw a brick wall (running bond) whose bricks differ in tone."""
     u, v = _grid(pixels)
     row = np.floor(v * rows)
     shifted = u * columns + 0.5 * (row % 2)
@@ -117,7 +121,7 @@ def mottled(
     a: Color = (0.5, 0.48, 0.44), b: Color = (0.3, 0.29, 0.27), scale: float = 6.0, sharp: float = 1.0, seed: int = 0,
     pixels: int = 512,
 ) -> Array:  # fmt: skip
-    """Mix two colors at random: plaster, stone, asphalt, cloth, rust."""
+    """Mix two colors at random, to imitate plaster, stone, asphalt, cloth or rust."""
     u, v = _grid(pixels)
     mix = fractal_noise(np.stack((u, v), -1) * scale, seed, 6)
     mix = np.clip((mix - 0.5) * 2.5 * sharp + 0.5, 0, 1)[..., None]
@@ -128,7 +132,7 @@ def stripes(
     colors: tuple[Color, ...] = ((0.6, 0.1, 0.08), (0.7, 0.68, 0.62)), count: int = 6, across: bool = False,
     seed: int = 0, pixels: int = 512,
 ) -> Array:  # fmt: skip
-    """Draw slightly worn stripes of equal width along u, or along v if ``across``."""
+    """Draw slightly worn stripes of equal width along u. If ``across`` is True, draw them along v."""
     u, v = _grid(pixels)
     which = np.floor((u if across else v) * count).astype(int) % len(colors)
     worn = 0.85 + 0.3 * fractal_noise(np.stack((u, v), -1) * 12, seed, 4)
@@ -156,7 +160,7 @@ def printed(
     paper: Color = (0.72, 0.69, 0.6), ink: Color = (0.05, 0.06, 0.1), accent: Color = (0.55, 0.08, 0.05),
     seed: int = 0, pixels: int = 512,
 ) -> Array:  # fmt: skip
-    """Draw a cover or poster: a frame, a picture of colored shapes, lines of words."""
+    """Draw a printed cover or poster, with a frame, a picture of colored shapes, and lines of text."""
     random = np.random.default_rng(seed)
     picture = np.tile(np.array(paper), (pixels, pixels, 1))
     u, v = _grid(pixels)
@@ -181,7 +185,7 @@ def printed(
 
 
 def image(file: str, folder: Path = Path(".")) -> Array:
-    """Read a user's picture. Files of 8 bits are decoded as sRGB, others are linear.
+    """Read a user's picture. Files with 8 bits are decoded as sRGB; files with more bits are linear.
 
     Raises:
         PolarguideError: the file is not a color picture.
@@ -208,7 +212,7 @@ TEXTURES: dict[str, Callable[..., Array]] = {
 
 
 def make_texture(data: dict[str, Any], where: str, folder: Path) -> Array:
-    """Create the picture [H, W, 3] of the data of a texture.
+    """Create the picture [H, W, 3] of a texture from its data.
 
     Args:
         data: type and fields.
@@ -227,7 +231,7 @@ def make_texture(data: dict[str, Any], where: str, folder: Path) -> Array:
 
 
 def _grid(pixels: int) -> tuple[Array, Array]:
-    """Return u and v [pixels, pixels] of pixel centers."""
+    """Return the texture coordinates u and v of pixel centers, [pixels, pixels] each."""
     at = (np.arange(pixels) + 0.5) / pixels
     v, u = np.meshgrid(at, at, indexing="ij")
     return u, v
@@ -259,7 +263,10 @@ def sky(
     sun: tuple[float, float] = (40.0, 60.0), brightness: float = 1.0, sunlight: float = 40.0, clouds: float = 0.5,
     ground: Color = (0.12, 0.11, 0.10), skyline: float = 8.0, seed: int = 0, height: int = HEIGHT,
 ) -> Array:  # fmt: skip
-    """Create a sky with clouds, a hazy sun (elevation and azimuth in degrees), and a skyline of houses and trees."""
+    """Create a panorama of a sky with clouds, a hazy sun, and a skyline of houses and trees.
+
+    ``sun`` is the elevation and azimuth of the sun in degrees.
+    """
     d = directions(height)
     up = np.clip(d[..., 2], 0, 1)[..., None]
     blue = np.array([0.85, 0.92, 1.0]) * (1 - up) ** 3 + np.array([0.16, 0.33, 0.72]) * (1 - (1 - up) ** 3)
@@ -279,13 +286,13 @@ def sky(
 
 
 def _direction(angles: tuple[float, float]) -> Array:
-    """Return the unit direction of an elevation and an azimuth in degrees."""
+    """Return the unit vector of a direction, given its elevation and azimuth in degrees."""
     high, azimuth = np.radians(angles)
     return np.array([np.cos(high) * np.cos(azimuth), np.cos(high) * np.sin(azimuth), np.sin(high)])
 
 
 def _skyline(picture: Array, d: Array, highest: float, brightness: float, seed: int) -> None:
-    """Paint houses with windows, and trees between them, up to ``highest`` degrees."""
+    """Paint houses with windows, and trees between them. They are up to ``highest`` degrees tall."""
     elevation = np.degrees(np.arcsin(np.clip(d[..., 2], -1, 1)))
     turn = np.degrees(np.arctan2(d[..., 1], d[..., 0])) % 360
     random = np.random.default_rng(seed + 9)
@@ -313,7 +320,7 @@ def room(
     ceiling: Color = (0.5, 0.49, 0.47), floor: Color = (0.16, 0.1, 0.06), window: float = 9.0, lamp: float = 5.0,
     warm: float = 0.25, seed: int = 0, height: int = HEIGHT,
 ) -> Array:  # fmt: skip
-    """Create a furnished room seen from its center, with windows, ceiling lamps, pictures, shelves and a door."""
+    """Create a panorama of a furnished room, with windows, ceiling lamps, pictures, shelves and a door."""
     d = directions(height)
     low = np.array([-size[0] / 2, -size[1] / 2, -eye])
     high = np.array([size[0] / 2, size[1] / 2, size[2] - eye])
@@ -381,12 +388,13 @@ def studio(
     seed: int = 0,
     height: int = HEIGHT,
 ) -> Array:
-    """Create a dark studio with softboxes.
+    """Create a panorama of a dark studio with softboxes.
 
     Args:
-        boxes: data of the softboxes, each with ``at`` (elevation, azimuth), ``size`` in degrees, and ``radiance``.
-        floor, top: radiance at nadir and zenith.
-        seed: seed of the variation.
+        boxes: data of the softboxes. Each has ``at`` (elevation, azimuth), ``size`` in degrees, and ``radiance``.
+        floor: radiance at the nadir.
+        top: radiance at the zenith.
+        seed: seed of the random variation.
         height: height of the panorama in pixels.
     """
     d = directions(height)
@@ -411,7 +419,7 @@ ENVIRONMENTS: dict[str, Callable[..., Array]] = {
 
 
 def make_environment(data: dict[str, Any], where: str, folder: Path) -> Array:
-    """Create the panorama [H, W, 3] of the data of an environment; see ``make_texture``.
+    """Create the panorama [H, W, 3] of an environment from its data. Arguments are as in ``make_texture``.
 
     Raises:
         PolarguideError: the type, a field or a value is invalid.

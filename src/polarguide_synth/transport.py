@@ -1,4 +1,4 @@
-"""Polarized path tracing that separates the two lobes of the first surface.
+"""Polarized path tracing that separates the specular and the diffuse lobe of the first surface.
 
 Mitsuba supplies geometry, polarized BSDFs and emitters. The integrator is our own, because Mitsuba's integrators add
 the lobes. Two independent paths start at the first surface, one by the specular lobe and one by the diffuse lobe.
@@ -20,7 +20,7 @@ from polarguide_synth.settings import dr, mi
 
 
 def opaque_value(kind: Any, value: float) -> Any:
-    """Convert a number to a type of Mitsuba, without a literal in the kernel: one kernel then serves all views."""
+    """Convert a number to a type of Mitsuba without compiling it into the kernel. All views then share one kernel."""
     return kind(value) if mi.variant().startswith("scalar") else dr.opaque(kind, value)
 
 
@@ -28,7 +28,7 @@ def pinhole(camera: Camera) -> list[Any]:
     """Convert a camera to Mitsuba's types.
 
     Returns:
-        Width, (fx, fy, cx, cy), the axes of the camera in the world, and its center.
+        Width of the picture; (fx, fy, cx, cy); axes of the camera in the world; and its center.
     """
     inner = [opaque_value(mi.Float, value) for value in (camera.fx, camera.fy, camera.cx, camera.cy)]
     # The rows of the world-to-camera rotation are the camera's axes in the world.
@@ -38,7 +38,7 @@ def pinhole(camera: Camera) -> list[Any]:
 
 
 def primary_rays(camera: list[Any], pixel: Any, place: Any) -> tuple[Any, Any]:
-    """Create rays through points in pixels.
+    """Create rays from the camera through points in pixels.
 
     Args:
         camera: result of ``pinhole``.
@@ -46,7 +46,7 @@ def primary_rays(camera: list[Any], pixel: Any, place: Any) -> tuple[Any, Any]:
         place: position in the pixel, [0, 1)^2.
 
     Returns:
-        Mitsuba's rays, and the x axis of the lens frame of each ray (see ``optics.lens_frame``), in world axes.
+        Mitsuba's rays; and the x axis of the lens frame of each ray (see ``optics.lens_frame``), in world axes.
     """
     width, (fx, fy, cx, cy), axes, origin = camera
     row = pixel // width
@@ -60,10 +60,10 @@ def primary_rays(camera: list[Any], pixel: Any, place: Any) -> tuple[Any, Any]:
 
 
 def lens_stokes(light: list[Any], ray: Any, x_ref: Any) -> list[Any]:
-    """Convert Stokes vectors from Mitsuba's frame of ``-ray.d`` to our lens frame.
+    """Convert Stokes vectors from Mitsuba's frame of ``-ray.d`` to the lens frame.
 
-    Mitsuba measures angles from its basis counter-clockwise as seen against the light, and so do we. Only the basis
-    differs.
+    Both conventions measure angles counter-clockwise as seen against the light. They differ only in the direction of
+    angle 0.
 
     Args:
         light: [S0, S1, S2].
@@ -77,13 +77,13 @@ def lens_stokes(light: list[Any], ray: Any, x_ref: Any) -> list[Any]:
 
 
 _PRIMES = (2, 3, 5, 7, 11, 13, 17, 19, 23, 29, 31, 37, 41)
-"""Primes whose square roots are the steps of the sequence, one for each dimension."""
+"""Primes whose square roots are the steps of the random sequence, one for each dimension."""
 _RANGE = 2**32
 """Number of 32-bit integers."""
 
 
 class Sampler:
-    """Random numbers for one sample of each pixel.
+    """Generator of random numbers for one sample of each pixel.
 
     The first dimensions follow a Kronecker sequence with the square roots of primes, with a random shift per pixel and
     dimension (Cranley and Patterson 1976). Every single sample is uniform. Estimates are therefore unbiased.
@@ -94,7 +94,7 @@ class Sampler:
         seed: seed of the view, as Mitsuba's unsigned integer.
 
     Attributes:
-        later: generator of independent numbers for the later dimensions.
+        later: generator of independent numbers for the remaining dimensions.
     """
 
     def __init__(self, pixel: Any, sample: Any, seed: Any) -> None:
@@ -105,7 +105,7 @@ class Sampler:
         self.later = mi.PCG32(1, mi.sample_tea_64(pixel, seed) + mi.UInt64(sample), mi.UInt64(sample))
 
     def next(self) -> Any:
-        """Return the next dimension of the sequence, in [0, 1)."""
+        """Return random numbers in [0, 1) for the next dimension of the sequence."""
         step = int((_PRIMES[self._used] ** 0.5 % 1) * _RANGE)
         self._used += 1
         shift = mi.sample_tea_32(self._pixel, self._seed + mi.UInt32(self._used))[0]
@@ -114,12 +114,12 @@ class Sampler:
         return dr.minimum(mi.Float(value) * (1 / _RANGE), 1 - 2.0**-24)
 
     def pair(self) -> Any:
-        """Return the next two dimensions as a point."""
+        """Return random points in a unit square, from the next two dimensions of the sequence."""
         return mi.Point2f(self.next(), self.next())
 
 
 LEAST_DENSITY = 1e-5
-"""Density per steradian below which directions are not sampled."""
+"""Smallest density of a sampled direction, per steradian."""
 DirectionSampler = Callable[[Any, Any, Any, Any, Any, Any], tuple[Any, Any]]
 
 
@@ -127,7 +127,8 @@ def sample_bsdf(bsdf: Any, context: Any, si: Any, numbers: Any, toward: Any, act
     """Sample a direction with Mitsuba's BSDF.
 
     Returns:
-        (value, density) for the direction ``toward`` a light; (direction, density, weight, delta) of the sample.
+        (value, density) of the BSDF for the direction ``toward`` a light; and (direction, density, weight, delta) of
+        the sampled direction.
     """
     evaluated = bsdf.eval_pdf(context, si, toward, active)
     sample, weight = bsdf.sample(context, si, *numbers, active)
@@ -140,11 +141,11 @@ def sample_cosine(
 ) -> tuple[Any, Any]:
     """Sample a direction with a density proportional to the cosine.
 
-    Mitsuba 3.9 evaluates the diffuse lobe of a coated surface correctly. If only this lobe is selected, its densities
-    are wrong: they are the densities of both lobes together.
+    It replaces ``sample_bsdf`` for the diffuse lobe of a coated surface. Mitsuba 3.9 evaluates this lobe correctly. If
+    only this lobe is selected, however, its densities are those of both lobes together.
 
     Returns:
-        As ``sample_bsdf``.
+        The same values as ``sample_bsdf``.
     """
     value = bsdf.eval(context, si, toward, active)
     side = dr.sign(si.wi.z)  # surfaces have two sides
@@ -160,11 +161,11 @@ def sample_cosine(
 
 
 TINY = 1e-30
-"""Lower bound of divisors."""
+"""Lower bound of divisors, to avoid a division by zero."""
 VISIBLE = "visible"
-"""Attribute of a shape, 1 if the camera sees it and 0 if it is black to the camera."""
+"""Name of the attribute of a shape that is 1 if the camera sees it, and 0 if it is black to the camera."""
 ROULETTE_FROM = 1
-"""Number of surfaces after which Russian roulette starts."""
+"""Number of surfaces on a path after which Russian roulette starts."""
 
 
 @dataclass(frozen=True)
@@ -173,9 +174,9 @@ class PathLimits:
 
     Attributes:
         depth: largest number of surfaces on a path.
-        clamp: largest radiance that one path may contribute from beyond its second surface, in scene units; the Stokes
-            vector of a brighter path is scaled down as a whole. 0: no limit and no bias.
-        visible_only: show the camera only shapes whose attribute ``VISIBLE`` is 1.
+        clamp: largest radiance that one path may contribute from beyond its second surface, in scene units. The Stokes
+            vector of a brighter path is scaled down as a whole. If 0, there is no limit and no bias.
+        visible_only: True to show the camera only shapes whose attribute ``VISIBLE`` is 1.
     """
 
     depth: int = 6
@@ -186,7 +187,7 @@ class PathLimits:
 def trace_paths(
     scene: Any, ray: Any, sampler: Sampler, limits: PathLimits
 ) -> tuple[list[Any], list[Any], Any]:
-    """Trace the light that arrives along rays, separately for the lobes of the first surface.
+    """Trace the light that arrives along rays, separately for the two lobes of the first surface.
 
     Args:
         scene: Mitsuba scene, of a polarized variant.
@@ -195,8 +196,8 @@ def trace_paths(
         limits: limits of the paths.
 
     Returns:
-        (specular, diffuse, emitted): [S0, S1, S2] of either lobe in Mitsuba's frame of the direction ``-ray.d``; the
-        directly visible radiance of light sources and environment.
+        [S0, S1, S2] of the specular lobe in Mitsuba's frame of the direction ``-ray.d``; [S0, S1, S2] of the diffuse
+        lobe; and the directly visible radiance of light sources and environment.
     """
     si = scene.ray_intersect(ray)
     visible = _visible(si) if limits.visible_only else mi.Bool(True)
@@ -221,17 +222,17 @@ def trace_paths(
 def _continue_paths(
     scene: Any, light: list[Any], after: tuple[Any, ...], sampler: Sampler, limits: PathLimits
 ) -> list[Any]:
-    """Add the light that the paths collect after the first surface.
+    """Continue paths after the first surface, and add the light that they collect.
 
     Args:
         scene: Mitsuba scene.
-        light: [S0, S1, S2] so far.
+        light: [S0, S1, S2] of the light up to the first surface.
         after: state of the paths after the first surface, from ``_scatter``.
         sampler: random numbers of every path.
         limits: limits of the paths.
 
     Returns:
-        [S0, S1, S2].
+        [S0, S1, S2] of all light.
     """
     both = mi.BSDFContext()
 
@@ -242,7 +243,7 @@ def _continue_paths(
              delta: Any, random: Any) -> Any:  # fmt: skip
         si = scene.ray_intersect(ray, active)
         rival = 0.0
-        if si.emitter(scene) is not None:  # always, except in the scalar variant
+        if si.emitter(scene) is not None:  # None only in the scalar variant
             sample = mi.DirectionSample3f(scene, si, place)
             rival = scene.pdf_emitter_direction(place, sample, active & (delta ^ True))
         share = dr.select(delta, 1.0, pdf / dr.maximum(pdf + rival, TINY))
@@ -272,20 +273,21 @@ def _scatter(
     active: Any,
     sample_direction: DirectionSampler,
 ) -> tuple[list[Any], tuple[Any, ...]]:
-    """Estimate the direct light at a surface, and continue the path.
+    """Estimate the direct light at a surface, and continue the path in a new direction.
 
     Args:
         scene: Mitsuba scene.
         ray: rays that arrive.
-        si: their intersections.
+        si: intersections of the rays with surfaces.
         context: selection of the lobes.
         gain: Mueller matrix of the path from this surface to the camera.
         numbers: random numbers for a lobe, a direction and a light.
-        active: paths that continue.
+        active: True for paths that continue.
         sample_direction: ``sample_bsdf`` or ``sample_cosine``.
 
     Returns:
-        [S0, S1, S2] at the camera, and (active, ray, gain, place, density, delta) of the ray that leaves.
+        [S0, S1, S2] of the direct light at the camera; and (active, ray, gain, place, density, delta) of the ray that
+        leaves.
     """
     if active is False:  # the scalar variant: there is no surface
         return [mi.UnpolarizedSpectrum(0.0)] * 3, (
@@ -316,7 +318,7 @@ def _scatter(
 
 
 def _russian_roulette(state: tuple[Any, ...], number: Any, where: Any) -> tuple[Any, ...]:
-    """End paths of small throughput at random, and raise the weight of the others (Russian roulette)."""
+    """End paths of small throughput at random, and increase the weight of the remaining paths to compensate."""
     active, ray, gain, *rest = state
     chance = dr.select(where, dr.clip(dr.max(gain[0, 0]), 0.1, 1.0), 1.0)
     return active & (number < chance), ray, gain * (1 / chance), *rest
@@ -329,14 +331,14 @@ def _emitted(scene: Any, si: Any, active: Any) -> Any:
 
 
 def _visible(si: Any) -> Any:
-    """Return True where the camera sees the surface at an intersection, False for lights and the environment."""
-    if si.shape is None:  # the scalar variant
+    """Return True if the camera sees the surface at an intersection. Return False for lights and the environment."""
+    if si.shape is None:  # occurs only in the scalar variant
         return False
     return si.shape.eval_attribute_1(VISIBLE, si, mi.Bool(si.is_valid())) > 0.5
 
 
 def _limited(light: list[Any], limit: float, where: Any) -> list[Any]:
-    """Scale a Stokes vector until no wavelength of its S0 exceeds the limit; 0: no limit."""
+    """Scale down a Stokes vector if S0 exceeds the limit at any wavelength. A limit of 0 has no effect."""
     if limit <= 0:
         return light
     peak = dr.max(light[0])

@@ -1,4 +1,4 @@
-"""The verb synth."""
+"""Command ``synth``."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def synth(
 
 
 def _confirm(seconds: float, yes: bool) -> None:
-    """Request confirmation of a long rendering on a terminal.
+    """Request confirmation of a long rendering if a terminal is available.
 
     Raises:
         PolarguideError: the user declines.

@@ -1,1 +1,1 @@
-"""Inspection of a capture: checks of its pictures and poses, and of the order, sense and zero of its angles."""
+"""Inspect a capture: check its pictures, its poses, and the polarizer angles that it states."""

@@ -1,4 +1,4 @@
-"""Order, sense and zero of the polarizer angles of views with four pictures: findings and checks."""
+"""Check the polarizer angles of views with four pictures: their order, their direction, and their zero."""
 
 from __future__ import annotations
 
@@ -31,17 +31,17 @@ MOSAICS = {
     (-1, 135): "--offset-x 1",
     (-1, 45): "--offset-y 1",
 }
-"""Options for such angles of a sensor's mosaics, by sense and zero."""
+"""Options of ``prepare`` that correct a sensor's mosaics, by the direction and zero of their angles."""
 
 
 class Hypothesis(NamedTuple):
-    """One of the eight orders with its evidence.
+    """One of the eight possible orders of the angles, with the probability that it is true.
 
     Attributes:
-        order: sense and zero.
+        order: direction ("sense") and zero of the angles.
         files: true angles of the pictures named 0, 45, 90 and 135.
         probability: posterior probability of the order.
-        log_odds: log odds of the most likely order to it, 0 or more.
+        log_odds: logarithm of the odds of the most likely order to this order, 0 or more.
     """
 
     order: Order
@@ -52,13 +52,14 @@ class Hypothesis(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class AngleFindings:
-    """Findings on the polarizer angles by geometry.
+    """Result of comparing the polarizer angles with the geometry of the scene.
 
     Attributes:
-        pairing: index into ``PAIRINGS``, from the pair sums.
-        sources: the evidence.
-        posterior: posterior of all usable evidence together; None without usable evidence.
-        applied: calibration that ``prepare`` applied; None for a scene of another origin.
+        pairing: pictures that belong to perpendicular angles, as an index into ``PAIRINGS``. It is found from sums of
+            two pictures.
+        sources: evidence from each source.
+        posterior: result of all usable evidence together. None without usable evidence.
+        applied: calibration that ``prepare`` applied. None for a scene that ``prepare`` did not write.
         mosaic: True if ``prepare`` developed mosaics of a sensor.
     """
 
@@ -69,7 +70,10 @@ class AngleFindings:
     mosaic: bool = False
 
     def correction(self, offset: float) -> str:
-        """Return the advice for a decided order and an offset: the complete calibration, not the difference."""
+        """Return the advice for a decided order and an offset of the angles.
+
+        It contains the complete new calibration, not the difference from the applied one.
+        """
         if self.order is None or self.files is None:
             return ""
         if self.applied is None:
@@ -91,17 +95,17 @@ class AngleFindings:
 
     @property
     def order(self) -> Order | None:
-        """The order, or None if it is not decided."""
+        """Order of the angles, or None if it is not decided."""
         return None if self.posterior is None else self.posterior.order
 
     @property
     def files(self) -> FileOrder | None:
-        """The true angles of the pictures named 0, 45, 90 and 135, or None if they are not decided."""
+        """True angles of the pictures named 0, 45, 90 and 135, or None if they are not decided."""
         return None if self.order is None else self.order.files(PAIRINGS[self.pairing])
 
     @property
     def hypotheses(self) -> list[Hypothesis]:
-        """All ``ORDERS`` with their evidence; empty without evidence."""
+        """All possible orders with their probabilities. Empty without evidence."""
         if self.posterior is None:
             return []
         rows = zip(ORDERS, self.posterior.probabilities, self.posterior.log_odds, strict=True)
@@ -109,7 +113,7 @@ class AngleFindings:
 
     @property
     def offset(self) -> float | None:
-        """The significant zero offset relative to the order, in degrees; None without one."""
+        """Offset of the zero relative to the order in degrees, or None if there is no significant offset."""
         zero = self.posterior
         if self.order is None or zero is None or not zero.is_precise or not zero.is_off(AngleLimits.zero_off):
             return None
@@ -147,13 +151,20 @@ def combine_evidence(
     *,
     mosaic: bool = False,
 ) -> AngleFindings:
-    """Combine the usable sources of evidence; ``applied`` and ``mosaic`` as in ``AngleFindings``."""
+    """Combine the usable sources of evidence on the polarizer angles.
+
+    Args:
+        sources: evidence from each source.
+        pairing: index into ``PAIRINGS``, as in ``AngleFindings``.
+        applied: calibration that ``prepare`` applied, as in ``AngleFindings``.
+        mosaic: True if ``prepare`` developed mosaics of a sensor.
+    """
     usable = [posterior(evidence) for evidence in sources if evidence.usable]
     return AngleFindings(pairing, tuple(sources), combine(usable) if usable else None, applied, mosaic)
 
 
 def angle_checks(angles: AngleFindings) -> list[Check]:
-    """Check order, sense and zero of the angles."""
+    """Check the order, the direction and the zero of the angles."""
     more = "Prepare the scene with poses (polarguide prepare ... --poses sfm) and inspect it again."
     if angles.sources:
         more = (
@@ -173,7 +184,7 @@ def angle_checks(angles: AngleFindings) -> list[Check]:
 
 
 def _order_check(angles: AngleFindings, posterior: OrderPosterior, more: str) -> Check:
-    """Check if the pictures are named by their true angles."""
+    """Check that the pictures are named by their true angles."""
     probability = max(posterior.probabilities)
     likely = sorted(
         (row for row in angles.hypotheses if row.probability > 0.02), key=lambda row: -row.probability
@@ -203,7 +214,7 @@ def _order_check(angles: AngleFindings, posterior: OrderPosterior, more: str) ->
 
 
 def _sense_check(angles: AngleFindings, posterior: OrderPosterior, more: str) -> Check:
-    """Check if the angles increase counter-clockwise as displayed."""
+    """Check that the angles increase counter-clockwise as displayed."""
     probability = posterior.sense_probability
     outcome = first_outcome(
         (
@@ -230,7 +241,7 @@ def _sense_check(angles: AngleFindings, posterior: OrderPosterior, more: str) ->
 
 
 def _zero_check(angles: AngleFindings, posterior: OrderPosterior, more: str) -> Check:
-    """Check if a polarizer angle of 0 degrees is the image's horizontal."""
+    """Check that a polarizer angle of 0 degrees is the image's horizontal."""
     offset = posterior.offset
     error = posterior.offset_error
     relation = "" if angles.order in (None, IDENTITY) else " (relative to the order above)"

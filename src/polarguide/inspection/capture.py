@@ -1,4 +1,4 @@
-"""Capture for an inspection. Poses may be missing, for all or some of its views."""
+"""Read a capture for an inspection. Some or all of its views may have no pose."""
 
 from __future__ import annotations
 
@@ -40,18 +40,19 @@ from polarguide.core.records import LARGEST_RECORD
 from polarguide.geometry.camera import Camera
 
 LONGEST = 640
-"""Largest longer side in pixels after averaging by whole factors."""
+"""Largest width or height of inspected pictures in pixels. Larger pictures are averaged by whole factors."""
 
 
 @dataclass(frozen=True, eq=False)
 class InspectedView:
-    """Pictures of a view, usually four, and its pose if it has one.
+    """Pictures of one view, usually four, and its pose if it has one.
 
     Attributes:
         name: name of the view.
         codes: linear intensities as in ``View.codes``, [K, H, W, 3] uint16.
-        invalid, saturated: as in ``View``, [H, W] bool.
-        black: pixels that are 0 in all angles; they are also ``saturated``.
+        invalid: mask of invalid pixels as in ``View``, [H, W] bool.
+        saturated: mask of saturated pixels as in ``View``, [H, W] bool.
+        black: mask of pixels that are 0 in all pictures. These pixels are also in ``saturated``.
         camera: camera at the size of ``codes``, or None.
         peak: largest stored value.
         exposures: exposures of the pictures.
@@ -72,25 +73,30 @@ class InspectedView:
 
     @property
     def usable(self) -> Tensor:
-        """Pixels with a measurement, [H, W] bool."""
+        """Mask of pixels with a valid measurement, [H, W] bool."""
         return ~(self.invalid | self.saturated)
 
 
 @dataclass(frozen=True, eq=False)
 class Capture:
-    """A capture under inspection.
+    """A capture that is inspected.
 
     Attributes:
-        root, name: the folder. layout: its files.
+        root: folder of the capture.
+        name: name of the folder.
+        layout: files of the capture.
         views: all views, sorted by name.
-        model: its COLMAP model, or None.
-        refractive_index: as ``scene.json`` gives it, or None.
-        applied: order, sense and zero that ``prepare`` applied; None for a scene of another origin.
-        factor: side of the averaged pixel boxes. transfer: how the files were read.
-        bits: bits of the files. size: width and height of the pictures as stored.
-        digest: SHA-256 over the stored pictures.
+        model: COLMAP model of the capture, or None.
+        refractive_index: refractive index that ``scene.json`` states, or None.
+        applied: order, direction and zero of the angles that ``prepare`` applied. None for a scene that ``prepare`` did
+            not write.
+        factor: width of the square pixel blocks that are averaged.
+        transfer: transfer function with which the files were read.
+        bits: bits of a stored value.
+        size: width and height of the pictures as stored.
+        digest: SHA-256 of the stored pictures.
         origin: kind of files that ``prepare`` developed.
-        exposures: exposures of the views by shared points, or None.
+        exposures: exposures of the views, estimated from points that they share, or None.
         test_names: names of the held-out views.
         keeps_gains: True for scenes of ``prepare --gains none``.
     """
@@ -119,12 +125,12 @@ class Capture:
 
     @property
     def cameras(self) -> list[tuple[InspectedView, Camera]]:
-        """The views with a pose, and their cameras."""
+        """Views that have a pose, each with its camera."""
         return [(view, view.camera) for view in self.views if view.camera is not None]
 
     @property
     def posed(self) -> tuple[InspectedView, ...]:
-        """The views with a pose."""
+        """Views that have a pose."""
         return tuple(view for view, _ in self.cameras)
 
 
@@ -138,10 +144,10 @@ def read_capture(
     """Read a scene folder for inspection.
 
     Args:
-        path: a folder in a layout that ``load_scene`` reads; a COLMAP model may be missing.
-        downscale: side of the pixel boxes to average; 0: until the longer side is at most 640.
+        path: a folder in a layout that ``load_scene`` reads. The COLMAP model may be missing.
+        downscale: width of the pixel blocks to average. If 0, it is chosen so that width and height are at most 640.
         transfer: "linear" or "srgb".
-        reporter: receives the progress.
+        reporter: receiver of the progress.
 
     Raises:
         PolarguideError: a file cannot be used.
@@ -205,11 +211,11 @@ def _inspected_view(item: ViewData, camera: Camera | None, full_scale: int | Non
 
 
 MEASURABLE = 1.0 / 256.0
-"""Smallest mean intensity of a pixel whose polarization can be measured: a step of 8 bits."""
+"""Smallest mean intensity of a pixel whose polarization can be measured. It is one step of an 8-bit value."""
 POLARIZED = 0.05
-"""Smallest DoLP of a polarized pixel."""
+"""Smallest DoLP of a pixel that counts as polarized."""
 OF_FOUR = ("noise", "noise_share", "pair_ratio", "sum_error", "dolp", "polarized", "above_limit")
-"""Measurements that need four angles of a view."""
+"""Names of the measurements that need pictures at four angles."""
 _QUANTILE_SAMPLES = 200_000
 
 
@@ -217,22 +223,23 @@ _QUANTILE_SAMPLES = 200_000
 class ViewMeasurements:
     """Measurements of one view.
 
-    ``saturated``, ``invalid`` and ``dark`` are shares of all pixels, others of usable pixels.
+    ``saturated``, ``invalid`` and ``dark`` are shares of all pixels. All remaining shares refer to usable pixels.
 
     Attributes:
-        view: its name.
+        view: name of the view.
         bright: 99th percentile of the intensities, in [0, 1].
-        saturated: share of pixels with an angle at full scale. invalid: share of pixels that the capture marks invalid
-            although they are not dark. dark: share of pixels below 1/256.
+        saturated: share of pixels that are at full scale in at least one picture.
+        invalid: share of pixels that the capture marks as invalid although they are not dark.
+        dark: share of pixels whose intensity is below 1/256.
         noise: median standard deviation of the noise of one intensity (mean over the colors), after averaging.
-        noise_share: the same, as a share of S0 / 2.
-        pair_ratio: median of (I0 + I90) / (I45 + I135); None if too few pixels are bright enough.
+        noise_share: ``noise`` divided by S0 / 2.
+        pair_ratio: median of (I0 + I90) / (I45 + I135). None if too few pixels are bright enough.
         sum_error: median of |I0 + I90 - I45 - I135| / S0.
-        dolp: quantiles 0.5 and 0.99 of the DoLP.
-        polarized: share with a DoLP above 0.05 and above three times its noise.
-        above_limit: share with a DoLP above the limit of diffuse light by three times its noise.
-        exposures: angles of other pictures than 0, 45, 90 and 135 degrees. Values that need four angles are then not
-            measured.
+        dolp: median and 99th percentile of the DoLP.
+        polarized: share of pixels whose DoLP exceeds 0.05 and three times its noise.
+        above_limit: share of pixels whose DoLP exceeds the limit of diffuse light by three times its noise.
+        exposures: exposures of the pictures if their angles are not 0, 45, 90 and 135 degrees. Values that need four
+            angles are then not measured.
     """
 
     view: str
@@ -258,7 +265,7 @@ class ViewMeasurements:
 
 
 def measure_view(view: InspectedView, index: float) -> ViewMeasurements:
-    """Measure one view.
+    """Measure the brightness, noise and polarization of one view.
 
     Args:
         view: the view.
@@ -297,7 +304,7 @@ def measure_view(view: InspectedView, index: float) -> ViewMeasurements:
 
 
 def quantile(values: Tensor, q: float) -> float:
-    """Return a quantile of the values, or of a regular subset of many values."""
+    """Return a quantile of values. If there are many values, a regular subset is used."""
     step = max(1, values.numel() // _QUANTILE_SAMPLES)
     # NumPy selects and torch sorts, which is much slower.
     return float(np.quantile(values.flatten()[::step].numpy(), q))

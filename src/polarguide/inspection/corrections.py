@@ -1,4 +1,4 @@
-"""Corrections of a capture: of its angles, as a new scene; and of its sensor's analyzers, in memory."""
+"""Correct a capture. Corrected angles are written as a new scene; a sensor calibration is applied in memory."""
 
 from __future__ import annotations
 
@@ -39,12 +39,12 @@ from polarguide.inspection.settings import Check
 from polarguide.preparation.journal import FourFactors, State, ViewRecord
 
 _COPIED = ("sparse", "masks", "invalid", "gt", "split.json", PRESENTATION_FILE)
-"""Files and folders that are copied unchanged."""
+"""Names of files and folders that are copied without changes."""
 METADATA = "scene.json"
 
 
 def correction(capture: Capture, angles: AngleFindings) -> Calibration | None:
-    """Return the correction of the angles, or None if they are right.
+    """Return the calibration that corrects the angles, or None if the angles are correct.
 
     Raises:
         PolarguideError: the order is not decided.
@@ -61,15 +61,17 @@ def correction(capture: Capture, angles: AngleFindings) -> Calibration | None:
 
 
 def fix_scene(capture: Capture, change: Calibration, out: Path, reporter: Reporter = SILENT) -> str:
-    """Write a corrected copy of a scene; the scene itself does not change.
+    """Write a corrected copy of a scene. The scene itself does not change.
 
-    If only the order changes, files are copied byte by byte under their right names. If the zero changes, the four
+    If only the order changes, files are copied byte by byte under their correct names. If the zero changes, the four
     intensities are recomputed and written as linear 16-bit PNG. They are divided by 1.21 so that no value exceeds full
     scale, and saturated pixels become invalid. The folder appears when it is complete.
 
     Args:
-        capture: the scene. change: result of ``correction``. out: a new folder.
-        reporter: receives the progress.
+        capture: the scene.
+        change: result of ``correction``.
+        out: a new folder.
+        reporter: receiver of the progress.
 
     Returns:
         A description of the correction.
@@ -83,7 +85,7 @@ def fix_scene(capture: Capture, change: Calibration, out: Path, reporter: Report
             out,
             expected="a new folder",
             found="a file" if not out.is_dir() else describe_contents(out),
-            remedy="Choose another --fix. Nothing was written.",
+            remedy="Specify another folder with --fix. Nothing was written.",
         )
     with temporary_folder(out) as partial:
         _write_corrected(capture, change, partial, reporter)
@@ -94,7 +96,7 @@ def fix_scene(capture: Capture, change: Calibration, out: Path, reporter: Report
 
 
 def describe_correction(change: Calibration) -> str:
-    """Describe a correction."""
+    """Describe a correction in a sentence for the user."""
     parts = {
         f"the files were renamed ({swaps(change.order)})": change.order != ANGLES,
         f"the Stokes vectors were rotated by {change.zero:+.2f}°": change.zero != 0.0,
@@ -123,7 +125,7 @@ def _write_corrected(capture: Capture, change: Calibration, folder: Path, report
 
 
 def _require_inside(root: Path, source: Path) -> None:
-    """Refuse links to files outside of the scene, because their targets would be copied.
+    """Check that a scene contains no links to files outside of it, because these files would be copied.
 
     Raises:
         PolarguideError: such a link exists.
@@ -135,7 +137,7 @@ def _require_inside(root: Path, source: Path) -> None:
                 path,
                 expected="a file of the scene",
                 found=f"a link to {path.resolve()}",
-                remedy="Replace the link by a copy, or remove it. Nothing was written.",
+                remedy="Replace the link by a copy of the file, or remove the link. Nothing was written.",
             )
 
 
@@ -151,7 +153,7 @@ def _rotate_view(capture: Capture, change: Calibration, folder: Path, view: str)
 
 
 def _corrected_metadata(capture: Capture, change: Calibration) -> bytes:
-    """Return ``scene.json`` of the copy: the scene's, with a note on the correction."""
+    """Return the content of ``scene.json`` for the corrected copy: the original content with a note on the correction."""
     path = capture.root / METADATA
     content: dict[str, Any] = read_record(path, dict[str, Any]) if path.exists() else {}
     note = {
@@ -168,12 +170,12 @@ def _corrected_metadata(capture: Capture, change: Calibration) -> bytes:
 
 
 STEPS = (1, 2, 4)
-"""Sensor pixels per pixel of a picture that ``prepare`` writes."""
+"""Allowed numbers of sensor pixels per pixel of a picture, along each axis, in scenes of ``prepare``."""
 _REMEDY = "Prepare the mosaics with it: polarguide prepare RAW --out SCENE --calibration FILE."
 
 
 class _SceneNotes(msgspec.Struct):
-    """The fields of ``scene.json`` that are read; ``sensor`` is an object in scenes of ``synth``."""
+    """Fields of ``scene.json`` that the correction needs. ``sensor`` is an object in scenes of ``synth``."""
 
     sensor: str | dict[str, Any] | None = None
     gains: FourFactors | None = None
@@ -182,13 +184,14 @@ class _SceneNotes(msgspec.Struct):
 
 
 def corrected(capture: Capture, path: Path) -> Capture:
-    """Return the capture corrected with the calibration of its sensor.
+    """Correct the pictures of a capture with the calibration of its sensor.
 
-    The matrices follow the steps of ``prepare``: its region, gains, order of the angles, and undistortion. They are
-    averaged like the pictures.
+    The correction matrices undergo the same steps as the pictures in ``prepare``: its region, gains, order of the
+    angles, and removal of lens distortion. They are then averaged like the pictures.
 
     Args:
-        capture: scene of one sensor's mosaics, or four pictures per view at its full, half or quarter size.
+        capture: a scene with mosaics of one sensor, or with four pictures per view at the full, half or quarter size of
+            the sensor.
         path: a file of ``polarguide calibrate``.
 
     Raises:
@@ -216,8 +219,8 @@ def corrected(capture: Capture, path: Path) -> Capture:
     if rotated:
         raise PolarguideError(
             capture.root,
-            expected="angles in steps of 45 degrees from those of the sensor",
-            found="a scene with another zero",
+            expected="a scene whose angles differ from those of its sensor by multiples of 45 degrees",
+            found="a scene with another zero of its angles",
             remedy=_REMEDY,
         )
     cache: dict[bytes, NDArray[np.float32]] = {}
@@ -247,13 +250,13 @@ def _record_fault(capture: Capture, view: str, found: str) -> PolarguideError:
 
 
 def _calibration_name(record: Mapping[str, str]) -> str:
-    """Return the name of a calibration by its record, for messages."""
+    """Return the name of a calibration, for messages. ``record`` is its record in ``scene.json``."""
     lens = f" and {record['lens']}" if record.get("lens") else ""
     return f"the calibration of {record.get('sensor', '')}{lens} ({record.get('sha256', '')[:16]})"
 
 
 def analyzer_check(capture: Capture, path: Path | None) -> Check | None:
-    """Report the calibration of the sensor's analyzers; None without one."""
+    """Report the calibration of the sensor that was applied. Return None if there is no calibration."""
     if path is not None:
         record = read_analyzers(path).record()
         finding = f"Corrected for this inspection with {_calibration_name(record)}."
@@ -279,10 +282,10 @@ def _matrices(
     capture: Capture,
     view: str,
 ) -> NDArray[np.float32]:
-    """Return matrices [4, 4, h, w] or [4, 4, h, w, 3] at the pixels of a view's pictures.
+    """Return correction matrices for the pixels of a view, [4, 4, h, w] or [4, 4, h, w, 3].
 
     Raises:
-        PolarguideError: ``prepare`` cannot have written the geometry or the camera.
+        PolarguideError: the geometry or the camera in the scene does not fit a scene of ``prepare``.
     """
     if prepared is None or notes.prepare is None:
         return calibration.of_pictures(capture.size[::-1])
@@ -309,7 +312,7 @@ def _matrices(
 def _by_true_angle(
     matrices: NDArray[np.float32], applied: Calibration | None, gains: tuple[float, ...] | None
 ) -> NDArray[np.float32]:
-    """Return matrices for pictures that were divided by gains and then named by their true angles."""
+    """Return correction matrices for pictures that were divided by gains and then named by their true angles."""
     scaled = matrices * np.asarray(gains or UNIT_GAINS, np.float32).reshape(1, 4, *[1] * (matrices.ndim - 2))
     if applied is None:
         return scaled

@@ -1,9 +1,9 @@
-"""Evidence on the angles from surface normals and points.
+"""Find the true polarizer angles by comparing the polarization with surface normals and points.
 
 Specular light is polarized perpendicular to the plane of incidence, diffuse light parallel to it. Normals come from a
-short training on photographs, the means of the four pictures. They do not depend on the order of the pictures, so a
-comparison with the AoLP is valid, and remains valid after a correction of the order. The state of the training is kept
-in a folder and resumed.
+short training on photographs, which are the means of the four pictures. They do not depend on the order of the
+pictures. A comparison with the AoLP is therefore valid, and remains valid after a correction of the order. The state of
+the training is kept in a folder and resumed.
 
 AoLP and azimuth of the normals agree modulo 90 degrees. The multiple of 90 degrees follows from certainly specular
 pixels, whose DoLP exceeds that of diffuse light at their zenith.
@@ -54,43 +54,44 @@ from polarguide.training.settings import StepReport, TrainSettings
 from polarguide.training.state import TrainingState
 
 NORMALS = "normals of a short training"
-"""Name of the evidence from normals."""
+"""Name of the evidence from normals in the report."""
 POINTS = "points observed in several views"
-"""Name of the evidence from points."""
+"""Name of the evidence from points in the report."""
 
 
 _SENSES = torch.tensor(SENSES)[:, None]
 
 
 def training_recipe(name: str) -> Recipe:
-    """Return a recipe with stages by its name."""
+    """Return the recipe with the given name. It must have stages."""
     recipe = recipe_named(name)
     assert isinstance(recipe, Recipe)
     return recipe
 
 
 class EvidenceLimits:
-    """Constants of the evidence.
+    """Thresholds and parameters for the evidence on the polarizer angles.
 
     Attributes:
         samples: largest number of pixels that are sampled in a view.
-        zenith_margin: largest error of a rendered zenith of certainly specular pixels, radians.
-        least_zenith: smallest zenith of a normal with a reliable azimuth, radians.
-        least_dolp: smallest DoLP of a pixel with a usable AoLP.
-        fewest_pixels: number of pixels with a normal that the evidence needs.
-        least_inliers: smallest share of pixels whose normals agree.
+        zenith_margin: assumed largest error of the zenith in a rendered normal, radians. A pixel counts as certainly
+            specular only if this error cannot explain its DoLP.
+        least_zenith: smallest zenith in radians at which the azimuth of a normal is reliable.
+        least_dolp: smallest DoLP at which the AoLP of a pixel is used.
+        fewest_pixels: smallest number of pixels with a normal for a usable result.
+        least_inliers: smallest share of pixels that must agree with their normals.
         largest_error: largest error of the normals, radians.
-        least_concentration: smallest length of the mean of ``exp(4 i (AoLP - azimuth))``: 1 for agreement modulo 90
-            degrees, 0 for none.
+        least_concentration: smallest length of the mean of ``exp(4 i (AoLP - azimuth))``. It is 1 if AoLP and azimuth
+            agree modulo 90 degrees, and 0 if they are unrelated.
         specular: share of certainly specular pixels that are polarized perpendicular to the plane of incidence.
-        normal_errors: candidates for the error of normals, radians.
-        inliers: candidates for the share of agreeing pixels.
-        fewest_observations: number of views that must observe a point.
-        fewest_points: number of points that the evidence needs.
-        largest_misfit: largest median angle in degrees between fields and their common plane.
+        normal_errors: tested values for the error of normals, radians.
+        inliers: tested values for the share of agreeing pixels.
+        fewest_observations: smallest number of views that must observe a point.
+        fewest_points: smallest number of points for a usable result.
+        largest_misfit: largest median angle in degrees between the field directions of a point and their common plane.
         least_scale: lower bound of the mean square of the fields' components along a normal.
-        opaque: smallest alpha of a rendered normal.
-        agreement: smallest cosine between the rendered normal and the normal of the depth.
+        opaque: smallest alpha at which a rendered normal is used.
+        agreement: smallest cosine between the rendered normal and the normal that follows from the depth.
     """
 
     samples = 400
@@ -114,12 +115,13 @@ class EvidenceLimits:
 
 @dataclass(frozen=True, eq=False)
 class ViewSurface:
-    """Surface in one view.
+    """Normals and depths of the surface that one view shows.
 
     Attributes:
         camera: camera at the size of the maps.
-        normal: unit normals in camera axes that face the camera, [H, W, 3]. depth: camera z, [H, W].
-        known: mask of reliable normals and depths, [H, W] bool.
+        normal: [H, W, 3] unit normals in camera axes, on the side of the camera.
+        depth: [H, W] depth along the camera's z axis.
+        known: [H, W] bool, mask of reliable normals and depths.
     """
 
     camera: Camera
@@ -130,11 +132,15 @@ class ViewSurface:
 
 @dataclass(frozen=True, eq=False)
 class SurfaceSamples:
-    """Pixels with a normal and a measured polarization.
+    """Sampled pixels with a normal and a measured polarization.
 
     Attributes:
-        aolp, dolp: measured, [N]. noise: standard deviation of the DoLP, [N].
-        azimuth, zenith: angles of the normal in radians, [N]. position: position in the world, [N, 3].
+        aolp: measured AoLP, [N].
+        dolp: measured DoLP, [N].
+        noise: standard deviation of the DoLP, [N].
+        azimuth: azimuth of the normal in radians, [N].
+        zenith: zenith of the normal in radians, [N].
+        position: position in the world, [N, 3].
     """
 
     aolp: Tensor
@@ -145,23 +151,26 @@ class SurfaceSamples:
     position: Tensor = field(kw_only=True)
 
     def certainly_specular(self, index: float) -> Tensor:
-        """Return True for pixels whose DoLP exceeds that of diffuse light at their zenith, [N] bool."""
+        """Return a mask [N] of pixels whose DoLP is too large for diffuse light at their zenith."""
         most = optics.diffuse_dolp((self.zenith + EvidenceLimits.zenith_margin).clamp(max=math.pi / 2), index)
         return self.dolp > most + 2 * self.noise
 
 
 def _polarization_planes(view: InspectedView, pairing: int) -> Tensor:
-    """Return the Stokes vector of the luminance, its noise, and 1 for unusable pixels: [1, 5, H, W]."""
+    """Return five maps [1, 5, H, W] of a view.
+
+    They are the three components of the Stokes vector of the luminance, its noise, and 1 for unusable pixels.
+    """
     gray = view.intensities().mean(dim=-1)[[PAIRINGS[pairing].index(angle) for angle in optics.ANGLES]]
     unusable = (~view.usable).float()
     return torch.cat((optics.stokes(gray), optics.intensity_noise(gray)[None], unusable[None]))[None]
 
 
 def sample_surfaces(pairs: Iterable[tuple[InspectedView, ViewSurface]], pairing: int = 0) -> SurfaceSamples:
-    """Sample pixels with a reliable normal and significant polarization, at most 400 per view.
+    """Sample at most 400 pixels per view that have a reliable normal and significant polarization.
 
     Args:
-        pairs: views and their surfaces, whose maps may be smaller than the pictures.
+        pairs: views and their surfaces. The maps of a surface may be smaller than the pictures.
         pairing: pairing of the pictures, an index into ``PAIRINGS``.
     """
     generator = torch.Generator().manual_seed(0)
@@ -189,12 +198,13 @@ def sample_surfaces(pairs: Iterable[tuple[InspectedView, ViewSurface]], pairing:
 
 
 def normal_evidence(pixels: SurfaceSamples, index: float) -> OrderEvidence:
-    """Return log-likelihoods of all zeros and both senses, given the normals.
+    """Return the log-likelihood of every zero and both directions of the angles, given the normals.
 
-    Twice a pixel's angle between AoLP and azimuth follows a mixture: a von Mises distribution about the perpendicular,
-    one about the parallel, and a uniform one. The first two have equal weights; for certainly specular pixels the first
-    has nearly all. Their width follows from the error of the normals over the sine of the zenith and from the noise of
-    the AoLP. That error and the uniform share are fitted by maximum likelihood.
+    Twice a pixel's angle between AoLP and azimuth follows a mixture of three distributions: a von Mises distribution
+    around the perpendicular, one around the parallel, and a uniform one. The first two have equal weights. For
+    certainly specular pixels, the first has nearly all of the weight. Their width follows from the error of the normals
+    divided by the sine of the zenith, and from the noise of the AoLP. The error of the normals and the uniform share
+    are fitted by maximum likelihood.
     """
     count = len(pixels.aolp)
     fewest = EvidenceLimits.fewest_pixels
@@ -226,7 +236,10 @@ def normal_evidence(pixels: SurfaceSamples, index: float) -> OrderEvidence:
 
 
 def _concentration(pixels: SurfaceSamples) -> float:
-    """Return the agreement of AoLP and azimuth modulo 90 degrees, for the better sense and the best zero, in [0, 1]."""
+    """Return how well AoLP and azimuth agree modulo 90 degrees, in [0, 1].
+
+    The result is the best over both directions of the angles and all zeros.
+    """
     angles = 4 * (_SENSES * pixels.aolp - pixels.azimuth)
     return float(torch.hypot(torch.cos(angles).mean(dim=1), torch.sin(angles).mean(dim=1)).max())
 
@@ -234,7 +247,10 @@ def _concentration(pixels: SurfaceSamples) -> float:
 def _log_likelihood(
     pixels: SurfaceSamples, specular: Tensor, zeros: Tensor, error: float, inliers: float
 ) -> Tensor:
-    """Return the log-density of the pixels' angles for both senses and zeros [Z] in degrees, [N, 2, Z]."""
+    """Return the log-density of each pixel's angle, [N, 2, Z].
+
+    Axes 2 and 3 are the direction of the angles, and the Z zeros in degrees.
+    """
     aolp_noise = pixels.noise / (2 * pixels.dolp)
     variance = (error / torch.sin(pixels.zenith)) ** 2 + aolp_noise**2
     concentration = (1 / (4 * variance)).clamp(max=200.0)[:, None, None]
@@ -250,7 +266,7 @@ def _log_likelihood(
 def point_evidence(
     views: tuple[InspectedView, ...], model: ColmapModel, index: float, pairing: int = 0
 ) -> tuple[OrderEvidence, SurfaceSamples | None]:
-    """Return log-likelihoods of all zeros and both senses, given the points of a COLMAP model.
+    """Return the log-likelihood of every zero and both directions of the angles, given the points of a COLMAP model.
 
     Args:
         views: views with a pose.
@@ -259,7 +275,7 @@ def point_evidence(
         pairing: pairing of the pictures, an index into ``PAIRINGS``.
 
     Returns:
-        The evidence; and, if it is usable, the observations with the normals at the best zero.
+        The evidence; and the observations with the normals at the best zero, or None if the evidence is not usable.
     """
     observations = model.observations([view.name for view in views])
     fields, weights, degrees = _observed_fields(views, model.points.double(), observations, index, pairing)
@@ -298,7 +314,10 @@ def point_evidence(
 def _point_samples(
     fields: Tensor, weights: Tensor, degrees: tuple[Tensor, ...], points: Tensor, zero: int
 ) -> SurfaceSamples:
-    """Return observations as samples, with the zenith of the normal perpendicular to the fields of their point."""
+    """Return the observations of points as samples.
+
+    The normal of a point is perpendicular to its field directions, which gives its zenith.
+    """
     e, p = fields.unbind(dim=2)
     rotated = math.cos(math.radians(zero)) * e + math.sin(math.radians(zero)) * p
     moment = torch.einsum("pv,pvi,pvj->pij", weights, rotated, rotated)
@@ -318,11 +337,11 @@ def _point_samples(
 def _observed_fields(
     views: tuple[InspectedView, ...], points: Tensor, visible: Tensor, index: float, pairing: int
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return fields and polarization of points in views.
+    """Return the directions of the electric field, and the polarization, that views observe at points.
 
     Returns:
-        Fields in the world and the axes perpendicular to field and ray, [2, P, V, 2, 3]; weights [P, V]; DoLP and its
-        noise [P, V, 2].
+        [2, P, V, 2, 3] directions of the field in the world, and of the axes perpendicular to field and ray; [P, V]
+        weights; and [P, V, 2] DoLP and its noise.
     """
     limit = float(optics.diffuse_dolp_limit(index))
     fields = torch.zeros(len(SENSES), len(points), len(views), 2, 3)
@@ -358,9 +377,10 @@ def _observed_fields(
 
 
 def _spread(fields: Tensor, weights: Tensor) -> Tensor:
-    """Return the weighted mean square of the fields' components along the best normal for every zero, [P, 180].
+    """Return how far the fields of each point deviate from a plane, for every zero, [P, 180].
 
-    A field rotated by z is ``cos z e + sin z p``, so the moments of all zeros follow from three moments.
+    The result is the weighted mean square of their components along the best normal. A field rotated by z is ``cos z e
+    + sin z p``, so the moments of all zeros follow from three moments.
     """
     share = weights / weights.sum(dim=1, keepdim=True)
     e, p = fields.unbind(dim=2)
@@ -376,9 +396,9 @@ def _spread(fields: Tensor, weights: Tensor) -> Tensor:
 
 
 NORMALS_RECIPE = "3dgs-dr:consistent"
-"""Recipe of the short training for normals."""
+"""Name of the recipe of the short training that gives the normals."""
 LONGEST = 160
-"""Longer side in pixels of the training's pictures after averaging by a whole factor."""
+"""Largest width or height of the training pictures in pixels, after averaging by a whole factor."""
 KEY = "short_run.json"
 SAVE_EVERY = 100
 
@@ -410,17 +430,17 @@ def short_run(
     recipe: Recipe | None = None,
     until: int = 0,
 ) -> TrainingState:
-    """Run or resume the short training, or load its finished state.
+    """Run or resume the short training that gives normals, or load its finished state.
 
     Args:
         scene: scene at the size of the training.
-        folder: folder of its state; the state of another scene or length is replaced.
-        steps: optimizer steps.
+        folder: folder of its state. The state of another scene or length is replaced.
+        steps: number of optimizer steps.
         backend: device and rasterizer.
-        on_step: function called after every step.
-        refractive_index: refractive index of the surfaces; None for that of the scene.
-        recipe: recipe of the training; None for ``NORMALS_RECIPE``.
-        until: step to stop after; 0 for the last.
+        on_step: callback after every step.
+        refractive_index: refractive index of the surfaces. If None, that of the scene is used.
+        recipe: recipe of the training. If None, ``NORMALS_RECIPE`` is used.
+        until: step after which the training stops. If 0, all steps are done.
     """
     recipe = recipe or training_recipe(NORMALS_RECIPE)
     settings = resolve(TrainSettings(steps, 0, refractive_index, begin_again=False), scene, recipe)
@@ -451,7 +471,7 @@ def short_run(
 
 
 def _is_state_of(folder: Path, key: dict[str, object]) -> bool:
-    """Return True if the folder contains a readable state of the same training."""
+    """Return True if the folder contains a readable state of a training with the given key."""
     try:
         return read_record(folder / KEY, dict[str, Any]) == key and (folder / CHECKPOINT).exists()
     except PolarguideError:
@@ -460,7 +480,7 @@ def _is_state_of(folder: Path, key: dict[str, object]) -> bool:
 
 @torch.no_grad()
 def trained_surface(state: TrainingState, view: View, backend: Backend) -> ViewSurface:
-    """Return the surface of the trained Gaussians in one view, on the CPU."""
+    """Return the surface that the trained Gaussians show in one view, on the CPU."""
     request = RenderRequest(sh_degree=0, depth=True)
     result = render(state.gaussians, view.camera, backend.rasterize, request).to("cpu")
     rays = view.camera.rays()

@@ -1,6 +1,6 @@
-"""Inspection of a scene: reading, all applicable checks, and the checks of poses.
+"""Inspect a scene: read it, and run all checks that apply.
 
-The checks of poses measure epipolar errors and gaps in the coverage.
+This module contains the checks of poses. They measure epipolar errors and gaps between the views.
 """
 
 from __future__ import annotations
@@ -60,22 +60,23 @@ from polarguide.inspection.view_checks import held_out_check, lens_check, view_e
 from polarguide.raster import Backend
 
 RUN_FOLDER = "short_run"
-"""Folder of the short training in the folder of an inspection."""
+"""Name of the folder for the short training, inside the folder of an inspection."""
 
 
 class PoseLimits:
-    """Constants of the checks of poses, and of the decision to train.
+    """Thresholds of the checks of poses, and of the decision to run the short training.
 
     Attributes:
         neighbors: number of views that each view is matched with.
         features: largest number of features of a view.
         fewest_matches: smallest number of matches for a comparison of two views.
-        ratio: largest distance of a match's descriptors over that of the second best match.
-        gate: share of the picture's diagonal; matches farther from their epipolar line are mismatches.
+        ratio: largest ratio of the descriptor distance of a match to that of the second best match.
+        gate: largest distance of a match from its epipolar line, as a share of the picture's diagonal. More distant
+            matches count as mismatches.
         typical_px: median epipolar error in stored pixels above which a capture gets a warning.
-        view_px: the same of one view.
+        view_px: median epipolar error in stored pixels above which a single view may get a warning.
         stands_out: smallest ratio of a bad view's error to that of the median view.
-        gap: degrees to the nearest view above which a view is isolated.
+        gap: angle in degrees to the nearest view above which a view is isolated.
         few_views: number of views below which a capture gets a warning.
         sure: probability of an order above which ``auto`` does not train.
         fewest_to_train: smallest number of views with a pose for a short training.
@@ -97,7 +98,7 @@ class PoseLimits:
 
 @dataclass(frozen=True)
 class PairError:
-    """Median distance between the feature matches of two views and their epipolar lines, in pixels as stored."""
+    """Epipolar error of two views: median distance of their matches from the epipolar lines, in stored pixels."""
 
     first: str
     second: str
@@ -106,7 +107,7 @@ class PairError:
 
 
 def epipolar_errors(capture: Capture) -> list[PairError]:
-    """Match every view with a pose with its nearest neighbors in position and viewing direction."""
+    """Match each view that has a pose with the views that are nearest in position and viewing direction."""
     views = [(view.name, camera, *_features(view)) for view, camera in capture.cameras]
     errors = (
         _pair_error(views[i], views[j], capture.factor)
@@ -116,7 +117,10 @@ def epipolar_errors(capture: Capture) -> list[PairError]:
 
 
 def view_errors(errors: Sequence[PairError]) -> dict[str, float]:
-    """Return the lower quartile of the errors of each view's pairs, which excludes the effect of a bad neighbor."""
+    """Return the error of each view, which is the lower quartile over its pairs.
+
+    The lower quartile is not affected by a single bad neighbor.
+    """
     by_view: dict[str, list[float]] = {}
     for pair in errors:
         for name in (pair.first, pair.second):
@@ -148,7 +152,7 @@ def _neighbor_pairs(cameras: Sequence[Camera]) -> list[tuple[int, int]]:
 
 
 _Features = tuple[str, Camera, NDArray[np.float64], NDArray[np.float32] | None]
-"""Name, camera, and positions [N, 2] and descriptors [N, 128] of features of a view."""
+"""Type of the features of a view: its name, its camera, their positions [N, 2], and their descriptors [N, 128]."""
 
 
 def _pair_error(first: _Features, second: _Features, factor: int) -> PairError | None:
@@ -181,7 +185,7 @@ def _pair_error(first: _Features, second: _Features, factor: int) -> PairError |
 
 
 def _fundamental(first: Camera, second: Camera) -> NDArray[np.float64]:
-    """Return F with ``x2^T F x1 = 0`` for pixels of the two views (Hartley and Zisserman, Eq. 9.2)."""
+    """Return the fundamental matrix F of two views, with ``x2^T F x1 = 0`` (Hartley and Zisserman, Eq. 9.2)."""
     rotation = (second.rotation @ first.rotation.T).numpy()
     x, y, z = second.translation.numpy() - rotation @ first.translation.numpy()
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
@@ -190,7 +194,7 @@ def _fundamental(first: Camera, second: Camera) -> NDArray[np.float64]:
 
 
 def pose_check(capture: Capture) -> Check:
-    """Check if feature matches agree with the poses."""
+    """Check that feature matches between views agree with the poses."""
     if capture.model is None:
         remedy = "Run polarguide prepare with --poses sfm or --poses PATH."
         return Check("poses", "n/a", "There are no poses.", remedy)
@@ -223,7 +227,7 @@ def pose_check(capture: Capture) -> Check:
 
 
 def coverage_check(capture: Capture) -> Check:
-    """Check if neighboring views are close enough to each other."""
+    """Check that neighboring views are close enough to each other."""
     cameras = [camera for _, camera in capture.cameras]
     if len(cameras) < 2:
         return Check("coverage", "n/a", "Fewer than two views have a pose.")
@@ -256,12 +260,15 @@ def coverage_check(capture: Capture) -> Check:
 
 @dataclass(frozen=True, eq=False)
 class Inspection:
-    """Findings of an inspection.
+    """Result of an inspection.
 
     Attributes:
-        capture: the capture. settings: settings of the inspection. index: refractive index that was used.
-        measurements: measurements of each view. checks: checks in the order of the page.
-        angles: order, sense and zero; for other pictures, the estimates of their polarizers.
+        capture: the capture.
+        settings: settings of the inspection.
+        index: refractive index that was used.
+        measurements: measurements of each view.
+        checks: checks in the order of the page.
+        angles: findings on the polarizer angles. For pictures at unusual angles, they are estimates for each picture.
     """
 
     capture: Capture
@@ -273,16 +280,16 @@ class Inspection:
 
     @property
     def verdict(self) -> Verdict:
-        """The worst verdict of all checks."""
+        """Worst verdict of all checks."""
         return worst(self.checks)
 
     def check(self, key: str) -> Check:
-        """Return the check with this key."""
+        """Return the check with the given key."""
         return next(check for check in self.checks if check.key == key)
 
 
 def inspection_folder(scene: Path, out: Path | None = None) -> Path:
-    """Return the folder of an inspection: ``out``, or SCENE-inspection next to the scene.
+    """Return the folder of an inspection: ``out`` if it is given, else SCENE-inspection next to the scene.
 
     Raises:
         PolarguideError: a file has this name, or the folder is inside a scene.
@@ -301,11 +308,11 @@ def inspect_scene(
     """Inspect a scene folder.
 
     Args:
-        path: the scene; it may have no poses.
-        out: folder of the state of a short training.
+        path: the scene. It may have no poses.
+        out: folder for the state of a short training.
         settings: settings of the inspection.
         backend: device and rasterizer of the short training.
-        reporter: receives the progress.
+        reporter: receiver of the progress.
 
     Raises:
         PolarguideError: the scene cannot be read, or a setting is out of range.
@@ -352,7 +359,7 @@ def _shots(
     backend: Backend,
     reporter: Reporter,
 ) -> tuple[list[Check], ShotFindings]:
-    """Return the checks of a capture with pictures at other angles, and the findings on their polarizers."""
+    """Return the checks of a capture with pictures at unusual angles, and the findings on their polarizers."""
     checks = [pictures_check(capture), *agreement_checks(capture), *light_checks(capture, measurements)]
     with reporter.track("matching features", 1):
         checks += [pose_check(capture), lens_check(capture), coverage_check(capture), held_out_check(capture)]
@@ -384,7 +391,11 @@ def _angles(
     backend: Backend,
     reporter: Reporter,
 ) -> tuple[AngleFindings, SurfaceSamples | None]:
-    """Return order, sense and zero by the available geometry, and pixels with normals if there are any."""
+    """Determine order, direction and zero of the angles from the available geometry.
+
+    Returns:
+        The findings; and the pixels with normals, or None if there are no normals.
+    """
     sources: list[OrderEvidence] = []
     pixels = None
     trains = settings.normals != "points" and len(capture.posed) >= PoseLimits.fewest_to_train
@@ -432,11 +443,13 @@ def _trained_pixels(
 def _training_scene(
     capture: Capture, settings: InspectSettings, reporter: Reporter, held_out: Sequence[str] | None = None
 ) -> Scene:
-    """Load the views with a pose at the size of a short training.
+    """Load the views that have a pose, at the size of a short training.
 
     Args:
-        capture: the capture. settings: settings of the inspection. reporter: receives the progress.
-        held_out: names of held-out views; None for the default.
+        capture: the capture.
+        settings: settings of the inspection.
+        reporter: receiver of the progress.
+        held_out: names of held-out views. If None, the default of a training is used.
     """
     factor = max(1, math.ceil(max(capture.size) / LONGEST))
     names = [view.name for view in capture.posed]

@@ -1,4 +1,4 @@
-"""Checks that need only the pictures: pair sums, encoding, exposure, saturation, noise, polarization."""
+"""Checks that need only the pictures: consistency of the angles, encoding, exposure, saturation and noise."""
 
 from __future__ import annotations
 
@@ -23,26 +23,31 @@ from polarguide.inspection.settings import LCD_TEST, Check, Verdict, first_outco
 
 
 class PictureLimits:
-    """Thresholds of the checks.
+    """Thresholds of the checks of pictures.
+
+    The "pair ratio" of a view is the median of (I0 + I90) / (I45 + I135).
 
     Attributes:
         pair_error: median |I0 + I90 - I45 - I135| / S0 of a view above which its four pictures are inconsistent.
-        unequal: deviation of the pair ratio from 1 for a warning; real sensors have about 0.02.
-        very_unequal: the same for the verdict "wrong"; a picture with 5 % more exposure gives 0.025.
-        exposed_unequal: largest difference of the logarithms of the gains of two angles without a warning; angles set
+        unequal: deviation of the pair ratio from 1 that causes a warning. Real sensors have about 0.02.
+        very_unequal: deviation of the pair ratio from 1 for the verdict "wrong". A picture with 5 % more exposure gives
+            0.025.
+        exposed_unequal: largest difference of the logarithms of the gains of two angles without a warning. Angles set
             to two degrees give 0.07, real sensors 0.04.
-        exposed_very_unequal: the same for the verdict "wrong"; a third of a stop gives 0.23.
-        unsteady: deviation of a view's pair ratio from the capture's.
+        exposed_very_unequal: difference of the logarithms of the gains for the verdict "wrong". A third of a stop gives
+            0.23.
+        unsteady: largest deviation of a view's pair ratio from that of the capture.
         saturated: share of saturated pixels above which a view gets a warning.
         blown: share of saturated pixels above which a capture is wrong.
         little: share of polarized pixels below which a capture gets a warning.
         almost_none: share of polarized pixels below which a capture is wrong.
-        noisy: noise of one intensity as a share of S0 / 2; three times its DoLP noise is then 0.13.
+        noisy: largest noise of one intensity, as a share of S0 / 2. Three times the noise of the DoLP is then 0.13.
         underexposed: 99th percentile of the values below which a view is underexposed.
-        bent: curvature of the response for the verdict "wrong" if it is significant. A gamma of 0.8 has -0.125, of 0.73
-            -0.18; DoLP has a similar error. Smooth areas of a real sensor's pictures have -0.17.
-        sure_bend: standard errors of a significant curvature. See ``AngleLimits.sure``.
-        not_dielectric: share of the pixels with normals, or of all pixels, above which the check warns.
+        bent: curvature of the response for the verdict "wrong" if it is significant. A gamma of 0.8 has -0.125, a gamma
+            of 0.73 has -0.18; DoLP has a similar error. Smooth areas of a real sensor's pictures have -0.17.
+        sure_bend: number of standard errors from which a curvature is significant. See ``AngleLimits.sure``.
+        not_dielectric: share of pixels above which the check warns. It refers to pixels with normals if there are any,
+            else to all pixels.
     """
 
     pair_error = 0.05
@@ -63,19 +68,25 @@ class PictureLimits:
 
 
 def find_pairing(capture: Capture) -> int | None:
-    """Return the pairing by the pair sums, an index into ``PAIRINGS``; None if they do not decide."""
+    """Find out which of the four pictures belong to perpendicular angles, by comparing sums of two pictures.
+
+    Return an index into ``PAIRINGS``, or None if the sums do not decide.
+    """
     residuals = np.array(
         [checks.measure(view.codes.numpy(), view.usable.numpy()).residuals for view in capture.views]
     )
     gains = measured_exposures(capture) if residuals.any() else None
     limit = PictureLimits.exposed_unequal / AngleLimits.sure
     if gains is not None and gains.pairing is not None and max(gains.errors) < limit:
-        return gains.pairing  # for any exposures
+        return gains.pairing  # also valid for unequal exposures
     return decide_pairing(residuals)
 
 
 def measured_exposures(capture: Capture) -> MeasuredGains | None:
-    """Return the exposures of the four angles by the pair sums of all views; None if they are too dark."""
+    """Estimate the relative exposures of the four angles, by comparing I0 + I90 with I45 + I135 in all views.
+
+    Return None if the pictures are too dark.
+    """
     moments = [
         pair_moments(view.intensities().mean(dim=-1).numpy(), view.usable.numpy()) for view in capture.views
     ]
@@ -85,7 +96,7 @@ def measured_exposures(capture: Capture) -> MeasuredGains | None:
 def picture_checks(
     capture: Capture, measurements: Sequence[ViewMeasurements], pairing: int | None
 ) -> list[Check]:
-    """Return all checks of four angles, in their order on the page."""
+    """Return all checks of pictures at four angles, in their order on the page."""
     if capture.origin == "stokes":
         computed = "The four pictures were computed from Stokes vectors: their sums agree by construction."
         return [
@@ -108,12 +119,12 @@ def picture_checks(
 
 
 def light_checks(capture: Capture, measurements: Sequence[ViewMeasurements]) -> list[Check]:
-    """Return the checks for pictures at any angles: saturation and brightness."""
+    """Return the checks for pictures at any angles, which are those of saturation and brightness."""
     return [_saturation(capture, measurements), _brightness(measurements)]
 
 
 def _majority(views: Sequence[str], measurements: Sequence[ViewMeasurements]) -> Verdict:
-    """Return "wrong" if more than half of the views are concerned, else "warning"."""
+    """Return "wrong" if a problem affects more than half of the views, else "warning"."""
     return "wrong" if 2 * len(views) > len(measurements) else "warning"
 
 
@@ -282,10 +293,10 @@ def _noise(measurements: Sequence[ViewMeasurements]) -> Check:
 
 
 def with_noise(angles: AngleFindings, measurements: Sequence[ViewMeasurements]) -> AngleFindings:
-    """Return the findings with noise in the error of the zero if the check of noise warns.
+    """Increase the uncertainty of the zero by the noise if the check of noise warns, and return the findings.
 
     In these captures, steps of a tone curve or compression cause noise that is not independent between pixels. The
-    error of the AoLP of one strongly polarized pixel is then also that of the zero.
+    error of the AoLP of one strongly polarized pixel is then also the error of the zero.
     """
     share = float(np.median([r.noise_share for r in measurements]))
     degree = float(np.median([r.dolp[1] for r in measurements]))
@@ -342,7 +353,7 @@ def _polarization(measurements: Sequence[ViewMeasurements]) -> Check:
 def dielectric_check(
     measurements: Sequence[ViewMeasurements], pixels: SurfaceSamples | None, index: float
 ) -> Check:
-    """Check if large areas are polarized more strongly than a dielectric under unpolarized light."""
+    """Check that large areas are not polarized more strongly than a dielectric under unpolarized light can be."""
     share = float(torch.tensor([r.above_limit for r in measurements]).median())
     limit = float(optics.diffuse_dolp_limit(index))
     finding = f"{share:.0%} of the pixels (median view) have a DoLP above the diffuse limit ({limit:.2f}). "
@@ -367,7 +378,10 @@ def dielectric_check(
 
 
 def exceeds_dielectric(pixels: SurfaceSamples, index: float) -> torch.Tensor:
-    """Return True for pixels whose DoLP exceeds both lobes at every zenith within the margin, [N] bool."""
+    """Return a mask [N] of pixels whose DoLP is too large for diffuse and specular light of a dielectric.
+
+    The comparison covers every zenith within the margin of error.
+    """
     steps = EvidenceLimits.zenith_margin * torch.linspace(-1, 1, 7)
     zenith = (pixels.zenith[:, None] + steps).clamp(0, math.pi / 2)
     most = torch.maximum(optics.specular_dolp(zenith, index), optics.diffuse_dolp(zenith, index)).amax(dim=1)

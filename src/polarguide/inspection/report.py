@@ -1,4 +1,4 @@
-"""Report of an inspection: an HTML page without scripts or external files, and ``inspection.json`` for programs."""
+"""Write the report of an inspection: an HTML page without scripts or external files, and ``inspection.json``."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from polarguide.visualization.figures import AOLP_FULL_DOLP, DOLP_HIGH, Picture
 from polarguide.visualization.pages import data_uri, page
 
 SIDE = 240
-"""Longest side of the pictures in pixels."""
+"""Largest width or height of the pictures on the page, in pixels."""
 NOISE_HIGH = 0.05
 EXCESS_HIGH = 0.1
 SATURATED_COLOR = (255, 40, 40)
@@ -31,11 +31,14 @@ INVALID_COLOR = (60, 120, 255)
 
 @dataclass(frozen=True)
 class Layer:
-    """A layer of the page.
+    """A kind of picture on the page, such as the DoLP of a view.
 
     Attributes:
-        key: name in HTML. label: name for readers. legend: description of its colors.
-        ramp: color map of the legend's bar, or None. caption: function that returns the line below a view.
+        key: name in HTML.
+        label: name on the page.
+        legend: description of its colors.
+        ramp: color map of the legend's bar, or None.
+        caption: function that returns the line below the picture of a view.
     """
 
     key: str
@@ -66,11 +69,11 @@ SHOT_LAYERS: tuple[Layer, ...] = (
     Layer("saturation", "Saturation", "Red: one picture at full scale. Blue: marked invalid, or black.", None,
           lambda r: f"{r.saturated:.1%} + {r.invalid:.1%}"),
 )  # fmt: skip
-"""Layers of captures with other pictures than four angles per view."""
+"""Kinds of pictures for captures whose angles are not the usual four."""
 
 
 def layer_uris(view: InspectedView, layers: Sequence[Layer]) -> dict[str, str]:
-    """Return layers of a view as data URIs, by key."""
+    """Draw the pictures of a view for the page. Return them as data URIs by key."""
     photograph = view.intensities().mean(dim=0)
     rgb = figures.radiance_to_rgb(photograph / max(quantile(photograph, 0.99), 1e-6))
     pictures = {"s0": rgb, "saturation": _mark(rgb, view)}
@@ -80,7 +83,7 @@ def layer_uris(view: InspectedView, layers: Sequence[Layer]) -> dict[str, str]:
 
 
 def _polarization_layers(view: InspectedView) -> dict[str, Picture]:
-    """Return charts that need pictures at four angles."""
+    """Draw the maps that need pictures at four angles."""
     gray = view.intensities().mean(dim=-1)
     stokes = optics.stokes(gray)
     s0 = stokes[0].clamp(min=1e-6)
@@ -95,7 +98,7 @@ def _polarization_layers(view: InspectedView) -> dict[str, Picture]:
 
 
 def _mark(picture: Picture, view: InspectedView) -> Picture:
-    """Return the photograph in dark gray, with saturated and invalid pixels in color."""
+    """Draw the photograph in dark gray, with saturated and invalid pixels in color."""
     dim = (picture.mean(axis=-1, keepdims=True) * 0.6).astype(np.uint8).repeat(3, axis=-1)
     for mask, color in (
         (view.black | view.invalid, INVALID_COLOR),
@@ -110,11 +113,11 @@ FILE = "inspection.html"
 
 
 def inspection_html(inspection: Inspection, reporter: Reporter = SILENT) -> str:
-    """Return the HTML page; all names and texts in it are escaped.
+    """Return the HTML page. All names and texts in it are escaped.
 
     Args:
         inspection: the findings.
-        reporter: receives the progress.
+        reporter: receiver of the progress.
     """
     capture = inspection.capture
     settings = inspection.settings
@@ -151,7 +154,7 @@ def inspection_html(inspection: Inspection, reporter: Reporter = SILENT) -> str:
 
 
 def _figures(measurements: Sequence[ViewMeasurements]) -> list[tuple[str, ...]]:
-    """Return header and rows of the table of measurements; single shots have fewer columns."""
+    """Return the header and the rows of the table of measurements. Single shots have fewer columns."""
     shots = any(r.exposures for r in measurements)
     columns: dict[str, Callable[[ViewMeasurements], str]] = {
         "view": lambda r: r.view,
@@ -174,16 +177,16 @@ _FOUR_COLUMNS: dict[str, Callable[[ViewMeasurements], str]] = {
     "polarized": lambda r: f"{r.polarized:.1%}",
     "above diffuse limit": lambda r: f"{r.above_limit:.1%}",
 }
-"""Columns of the table of measurements that need four angles."""
+"""Functions that format the columns of the table of measurements that need four angles, by column name."""
 
 
 SCHEMA = 2
-"""Version of the record. It increases if a key changes its meaning or is removed, but not for new keys."""
+"""Version of the record. It increases if a key is removed or changes its meaning, but not for new keys."""
 RECORD = "inspection.json"
 
 
 def inspection_record(inspection: Inspection) -> dict[str, Any]:
-    """Return the findings as plain JSON types; docs/reference/inspection.md describes the keys."""
+    """Return the findings as plain JSON types. docs/reference/inspection.md describes the keys."""
     capture = inspection.capture
     return dict(
         json_value(
@@ -215,7 +218,7 @@ def inspection_record(inspection: Inspection) -> dict[str, Any]:
 
 
 def write_inspection(inspection: Inspection, out: Path, reporter: Reporter = SILENT) -> tuple[Path, Path]:
-    """Write the page and ``inspection.json`` into a folder; return their paths.
+    """Write the page and ``inspection.json`` into a folder, and return their two paths.
 
     Raises:
         PolarguideError: a file cannot be written.

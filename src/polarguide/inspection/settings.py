@@ -39,7 +39,7 @@ class InspectSettings:
 
 Verdict = Literal["ok", "warning", "wrong", "n/a", "not verified"]
 ORDER: tuple[Verdict, ...] = ("n/a", "ok", "not verified", "warning", "wrong")
-"""Verdicts from none to the worst."""
+"""Verdicts of checks in increasing severity."""
 TITLES = {
     "pair_sums": "Consistency of the four angles",
     "encoding": "Linear encoding",
@@ -63,25 +63,25 @@ TITLES = {
     "modulation": "Filter",
     "angles": "Angles of the pictures",
 }
-"""Headings of the checks by key."""
+"""Headings of the checks on the page, by key."""
 LCD_TEST = (
     "Hold the filter in front of an LCD screen and rotate it. The side that faces the screen when it becomes dark must "
     "face the scene. If the filter was right, photograph glossy surfaces obliquely (50 to 65 degrees)."
 )
-"""Advice for pictures without modulation."""
+"""Advice for pictures whose brightness does not change with the polarizer angle."""
 
 
 @dataclass(frozen=True)
 class Check:
-    """Outcome of one check.
+    """Result of one check of a capture.
 
     Attributes:
         key: name in ``inspection.json``, one of ``TITLES``.
-        verdict: "ok"; "warning" for a decision by the user; "wrong"; "n/a" for an impossible check; "not verified" for
-            an impossible check of a property that training relies on.
-        finding: result, one or two sentences.
-        remedy: advice; empty if nothing is to be done.
-        views: views concerned; empty for all.
+        verdict: "ok", "warning" (the user has to decide), "wrong", "n/a" (the check is impossible), or "not verified"
+            (the check is impossible, but training relies on the property).
+        finding: result in one or two sentences.
+        remedy: advice. Empty if nothing is to be done.
+        views: affected views. Empty if the result concerns all views.
         figures: numbers on which the verdict is based.
     """
 
@@ -94,30 +94,30 @@ class Check:
 
     @property
     def title(self) -> str:
-        """Heading on the page."""
+        """Heading of the check on the page."""
         return TITLES[self.key]
 
     def record(self) -> dict[str, Any]:
-        """Return the check as JSON types; numbers that are not finite become null."""
+        """Return the check as JSON types. Numbers that are not finite become null."""
         return dict(json_value({"key": self.key, "title": self.title, **vars(self)}))
 
 
 def first_outcome(*rows: tuple[object, Verdict, str, str]) -> tuple[Verdict, str, str]:
-    """Return verdict, finding and remedy of the first row whose condition holds.
+    """Return verdict, finding and remedy of the first row whose condition is true.
 
     Args:
-        rows: condition, verdict, finding and remedy of each possible outcome, the most important first.
+        rows: possible outcomes, the most important first. Each has a condition, a verdict, a finding and a remedy.
     """
     return next(outcome for condition, *outcome in rows if condition)  # type: ignore[return-value]
 
 
 def worst(checks: Iterable[Check]) -> Verdict:
-    """Return the worst verdict among the checks; "n/a" without checks."""
+    """Return the worst verdict among the checks, or "n/a" if there are no checks."""
     return max((check.verdict for check in checks), key=ORDER.index, default="n/a")
 
 
 def json_value(value: Any) -> Any:
-    """Return a value as JSON types: floats rounded to six digits, null if they are not finite."""
+    """Convert a value to JSON types. Floats are rounded to six digits, and become null if they are not finite."""
     if isinstance(value, Mapping):
         return {str(key): json_value(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):

@@ -1,6 +1,6 @@
-"""Checks of captures of single shots: kinds of pictures, and agreement with their stated angles.
+"""Check captures of single shots: the kinds of their pictures, and the polarizer angles that they state.
 
-A short training without the stated angles estimates each picture's angle in closed form
+A short training without the stated angles estimates the angle of each picture in closed form
 (``training.angles.polarizers``). The estimates are compared with the stated angles.
 """
 
@@ -33,22 +33,22 @@ from polarguide.training.angles.polarizers import REMEDY, Judgment, Polarizers
 from polarguide.training.settings import StepReport
 
 RECIPE = "polarguide-stokes"
-"""Recipe of the short training."""
+"""Name of the recipe of the short training that estimates the angles."""
 
 
 class ShotLimits:
-    """Thresholds of the checks.
+    """Thresholds of the checks of single shots.
 
     Attributes:
-        certain: smallest share of the median modulation (``FittedAngle``) of a picture that can contradict its stated
-            angle. At 0.7 a wrong line of the demo (0.67) was not detected.
+        certain: smallest modulation (``FittedAngle``) of a picture that can contradict its stated angle, relative to
+            the median modulation. At 0.7 a wrong line of the demo (0.67) was not detected.
         contradicts: smallest difference in degrees that contradicts a stated angle. The short training has errors of 3
             to 7 degrees (median) on four scenes.
-        sigmas: standard errors of a significant difference. See ``AngleLimits.sure``.
-        fewest: smallest number of pictures with a determined angle for a comparison.
-        zero_off: degrees of a common offset for a warning.
-        zero_wrong: degrees of a common offset for the verdict "wrong".
-        redundant: smallest number of known angles of one view that can contradict each other.
+        sigmas: number of standard errors from which a difference is significant. See ``AngleLimits.sure``.
+        fewest: smallest number of pictures with an estimated angle for a comparison.
+        zero_off: offset in degrees, common to all angles, that causes a warning.
+        zero_wrong: offset in degrees, common to all angles, for the verdict "wrong".
+        redundant: smallest number of known angles in one view that can contradict each other.
         few_angles: smallest number of different angles in a capture that determines S1 and S2.
     """
 
@@ -65,17 +65,18 @@ class ShotLimits:
 CHAOS = (
     "Look for shifted lines in angles.csv, or prepare with --angles unknown: training then finds the angles."
 )
-"""Advice for stated angles without relation to the pictures."""
+"""Advice for stated angles that do not fit the pictures at all."""
 
 
 @dataclass(frozen=True)
 class ShotFindings:
-    """Polarizers of the pictures, estimated by the short training.
+    """Polarizer angles of the pictures, estimated by the short training.
 
     Attributes:
-        judgments: judgment of each picture through a filter, without its stated angle; empty without a training.
-        stated: stated exposure of each judgment.
-        why: reason for the lack of a training.
+        judgments: result for each picture through a filter, estimated without its stated angle. Empty without a
+            training.
+        stated: exposure that the user stated, for each element of ``judgments``.
+        why: reason why there was no training.
         unfiltered: True if no picture was taken through a filter.
     """
 
@@ -86,25 +87,25 @@ class ShotFindings:
 
     @property
     def determined(self) -> list[tuple[Judgment, float]]:
-        """Pictures that determine their angle, with the stated angle of each."""
+        """Results of the pictures whose angle could be estimated, each with the stated angle."""
         rows = zip(self.judgments, self.stated, strict=True)
         return [(judgment, s.angle) for judgment, s in rows if s.angle is not None and judgment.tells]
 
     @property
     def are_enough(self) -> bool:
-        """True if enough pictures determine their angle for a comparison."""
+        """True if the angles of enough pictures could be estimated for a comparison."""
         return len(self.determined) >= ShotLimits.fewest
 
     @property
     def rotation(self) -> CommonRotation:
-        """Sense and zero of the stated angles by the pictures that determine their angle."""
+        """Direction and zero of the stated angles, estimated from the pictures whose angle could be estimated."""
         if not self.are_enough:
             return CommonRotation()
         return common_rotation([j.angle for j, _ in self.determined], [angle for _, angle in self.determined])
 
     @property
     def undecided(self) -> tuple[Verdict, str]:
-        """Verdict and finding of a check that has too few pictures to compare."""
+        """Verdict and finding of a check for which too few angles could be estimated."""
         if all(exposure.angle is None for exposure in self.stated):
             return "n/a", "No angle is stated: training estimates them."
         count = len(self.determined)
@@ -130,7 +131,7 @@ class ShotFindings:
 
 
 def without_angles(scene: Scene) -> Scene:
-    """Return the scene with unknown angles of all pictures through a filter."""
+    """Return a copy of the scene in which all pictures through a filter have unknown angles."""
 
     def blank(view: View) -> View:
         return view.with_exposures(tuple(replace(e, angle=None) if e.filtered else e for e in view.exposures))
@@ -150,19 +151,19 @@ def estimate_shot_angles(
     """Estimate the polarizer angle of every shot by a training that starts without known angles.
 
     Args:
-        scene: scene at the size of the training; it needs training views.
-        folder: folder of the training's state, from which a stopped search resumes.
+        scene: scene at the size of the training. It needs training views.
+        folder: folder of the training's state. A stopped training resumes from it.
         steps: approximate number of training steps.
         refractive_index: refractive index of the surfaces.
         backend: device and rasterizer.
-        on_step: function called after every step.
+        on_step: callback after every step.
     """
     if not any(exposure.filtered for view in scene.train_views for exposure in view.exposures):
         return ShotFindings(why="No picture was taken through a filter.", unfiltered=True)
     recipe = training_recipe(RECIPE)
     blind = without_angles(scene)
     total = math.ceil(steps / recipe.angle_rules.last)
-    until = Polarizers(blind, recipe, total).search + 1  # fits precede a step
+    until = Polarizers(blind, recipe, total).search + 1  # the fit is done before the step
     state = short_run(
         blind,
         folder,
@@ -179,7 +180,7 @@ def estimate_shot_angles(
 
 
 def pictures_check(capture: Capture) -> Check:
-    """Check the number of pictures, and the differences of their angles."""
+    """Check that there are enough pictures, and that their angles differ enough."""
     exposures = [exposure for view in capture.views for exposure in view.exposures]
     angles = sorted({exposure.angle for exposure in exposures if exposure.angle is not None})
     unknown = sum(not exposure.known for exposure in exposures)
@@ -218,7 +219,10 @@ def pictures_check(capture: Capture) -> Check:
 
 
 def agreement_checks(capture: Capture) -> list[Check]:
-    """Check if the pictures of a view agree with each other; empty if no view has four or more known angles."""
+    """Check that the pictures of a view agree with each other.
+
+    Return an empty list if no view has four or more known angles.
+    """
     compared = 0
     notes = []
     wrong: list[str] = []
@@ -257,7 +261,7 @@ def agreement_checks(capture: Capture) -> list[Check]:
 
 
 def shot_checks(findings: ShotFindings) -> list[Check]:
-    """Check the filter, sense and zero of the angles, and each angle."""
+    """Check the filter, the direction and zero of the angles, and each single angle."""
     if findings.why:
         verdict: Verdict = "n/a" if findings.unfiltered else "not verified"
         return [

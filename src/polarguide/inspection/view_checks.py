@@ -1,4 +1,4 @@
-"""Checks that compare views at the points of the model: their exposures and focal lengths."""
+"""Checks that compare views with each other at the points of the model: exposures and focal lengths."""
 
 from __future__ import annotations
 
@@ -25,17 +25,18 @@ from polarguide.results.evaluation.coverage import Coverage, DepthMap
 
 
 class ViewLimits:
-    """Thresholds of the checks.
+    """Thresholds of the checks that compare views.
 
     Attributes:
         fewest: smallest number of points for the estimate of a focal length.
-        focal_differs: difference of the logarithm of a focal length for a warning; 1 % turns a ray at 30 degrees by
-            0.25 degrees.
-        focal_wrong: the same for the verdict "wrong".
-        step: step of camera exposures in stops; with a larger error, equal exposures are not confirmed.
-        unseen: share of a held-out view without a training view of the same content, above which it is named.
+        focal_differs: difference of the logarithm of a focal length that causes a warning. A difference of 1 % turns a
+            ray at 30 degrees by 0.25 degrees.
+        focal_wrong: difference of the logarithm of a focal length for the verdict "wrong".
+        step: step of camera exposures in stops. If the error of an exposure is larger, equal exposures are not
+            confirmed.
+        unseen: largest share of a held-out view that no training view shows. Views with a larger share are named.
         cells: number of cells across a picture in which content is compared.
-        most: number of points, about, that give the depths of these cells.
+        most: approximate number of points from which the depths of these cells are computed.
     """
 
     fewest = 50
@@ -48,7 +49,7 @@ class ViewLimits:
 
 
 def view_exposure_check(capture: Capture) -> Check:
-    """Check whether the views have equal exposure and white balance."""
+    """Check that all views have equal exposure and white balance."""
     exposures = capture.exposures
     if exposures is None or not np.isfinite(exposures.logs).any():
         return Check("view_exposure", "n/a", "The model stores no points that views share.")
@@ -89,9 +90,10 @@ def view_exposure_check(capture: Capture) -> Check:
 
 
 def held_out_check(capture: Capture) -> Check:
-    """Check if training views show what the held-out views show.
+    """Check that training views show the content of the held-out views.
 
-    The points of the model give the depth of each cell of a picture. Cells outside their convex hull show background.
+    The points of the model give the depth of each cell of a picture. Cells outside the convex hull of the points show
+    background.
     """
     cameras = {view.name: camera for view, camera in capture.cameras}
     tests = [name for name in capture.test_names if name in cameras]
@@ -123,7 +125,7 @@ def held_out_check(capture: Capture) -> Check:
 
 
 def _point_depths(camera: Camera, points: Tensor) -> DepthMap:
-    """Return the depths of the cells of a picture, interpolated between the points [M, 3] in it."""
+    """Return the depth of each cell of a picture, interpolated between the points [M, 3] that are visible in it."""
     cells = camera.downscaled(max(1, camera.width // ViewLimits.cells))
     _, depth, inside = seen_at(points - cells.center, cells)
     map_of_background = DepthMap(
@@ -142,7 +144,7 @@ def _point_depths(camera: Camera, points: Tensor) -> DepthMap:
 
 
 def lens_check(capture: Capture) -> Check:
-    """Check whether each view alone agrees with its focal length in the model."""
+    """Check that the focal length of each view agrees with the focal length that the view alone would have."""
     if capture.model is None:
         return Check("focal_lengths", "n/a", "There are no poses.")
     fits = {
@@ -179,10 +181,13 @@ def lens_check(capture: Capture) -> Check:
 
 
 def _focal_length_alone(model: ColmapModel, view: str) -> tuple[float, float] | None:
-    """Return the logarithm of the ratio of a view's own focal length to the model's, and its standard error.
+    """Estimate the focal length from one view alone, with fixed points, and compare it with the model.
 
-    Points are fixed. Pose and focal length minimize the distances in the picture. The error assumes independent
-    distances. Too few points give None.
+    Pose and focal length minimize the distances in the picture. The error assumes independent distances.
+
+    Returns:
+        Logarithm of the ratio of the estimated focal length to the model's; and its standard error. None if there are
+        too few points.
     """
     pixels, places = model.correspondences(view)
     if len(pixels) < ViewLimits.fewest:

@@ -1,4 +1,4 @@
-"""Picture sources: photographs through a polarizing filter, four shots a view or single ones at any angles."""
+"""Read photographs through a polarizing filter: four shots of each view, or single shots at any angles."""
 
 from __future__ import annotations
 
@@ -91,11 +91,13 @@ _WORKED = 3 * (2 + 2 + 4 + 4 + 4)
 
 
 class ShotsMeasured(Measured, kw_only=True):
-    """Measurements of the shots of a capture.
+    """Measurements that all shots of a capture share.
 
     Attributes:
-        transfer: transfer function of the files. scale: factor of the linear values.
-        rounding: rounding of codes. levels: levels of the stored values; None for those that the files state.
+        transfer: transfer function of the files.
+        scale: factor of the linear values.
+        rounding: steps to which stored values are rounded.
+        levels: black level and full scale of the stored values. None for shots whose files state them.
         light: exposures by file.
     """
 
@@ -107,22 +109,24 @@ class ShotsMeasured(Measured, kw_only=True):
 
 
 class ShotsSource(Source):
-    """Base of the sources of shots of an ordinary camera through a polarizing filter."""
+    """Base class for sources of shots that an ordinary camera took through a polarizing filter."""
 
     cameras = None
     measured_type = ShotsMeasured
     assumed: tuple[str, ...] = ()
-    """Assumptions about the capture, in sentences for the user."""
+    """Sentences for the user that list the assumptions about the capture."""
     _root: Path
 
     def __init__(self, paths: list[Path], views: dict[str, list[Path]], settings: FilterSettings) -> None:
         """Use the shots of each view in their order.
 
         Args:
-            paths: all files that are read. views: shots by view. settings: settings of the preparation.
+            paths: all files that are read.
+            views: shots by view.
+            settings: settings of the preparation.
 
         Raises:
-            PolarguideError: white balance or transfer do not fit the files.
+            PolarguideError: the white balance or the transfer function does not fit the files.
         """
         self._settings = settings
         self._of_view = views
@@ -136,39 +140,41 @@ class ShotsSource(Source):
                 "--white-balance",
                 expected="none for pictures; none or three gains for camera raw",
                 found=settings.white_balance,
-                remedy="Omit it.",
+                remedy="Remove the option.",
             )
         if raw and settings.transfer == "srgb":
             raise PolarguideError(
                 "--transfer",
                 expected="auto or linear for camera raw, which is developed without tone curve",
                 found="srgb",
-                remedy="Omit it.",
+                remedy="Remove the option.",
             )
         self._white = white
         self._as_stored: frozenset[str] = frozenset()
 
     def stored(self, view: str) -> Stored:
-        """Return size and orientation from the header of the view's first shot."""
+        """Return size and orientation of a view, from the header of its first shot."""
         first = self._of_view[view][0]
         if is_camera_raw(first):
             return Stored(*stored_frame(first))
         return Stored(stated_size(first), orientation(read_picture(first)))
 
     def lenses(self) -> dict[str, Lens]:
-        """Return the lenses from the EXIF tags of each view's first shot."""
+        """Return the lens of each view, from the EXIF tags of its first shot."""
         return camera_groups({view: paths[0] for view, paths in self._of_view.items()})
 
     def use_stored(self, views: Collection[str]) -> None:
-        """Develop these views without rotation."""
+        """Develop some views without rotation, regardless of their orientation tags."""
         self._as_stored = frozenset(views)
 
     def used_as_stored(self, view: str) -> bool:
-        """Return True if a view is not rotated, regardless of its orientation tag."""
+        """Return True if a view is developed without rotation, regardless of its orientation tag."""
         return view in self._as_stored
 
     def _require_memory(self, what: str) -> None:
-        """Refuse shots of a view that exceed the memory, by their headers alone; ``what`` is their name in messages.
+        """Check that the shots of the largest view fit into memory. Only headers are read.
+
+        ``what`` is the name of the shots in messages.
 
         Raises:
             PolarguideError: the largest view is too large.
@@ -181,11 +187,14 @@ class ShotsSource(Source):
         )
 
     def _angles(self, view: str) -> Sequence[Angle]:
-        """Return the angles of a view's pictures, as stated."""
+        """Return the angles of the pictures of a view, as files or settings state them."""
         return ANGLES
 
     def _decide_transfer(self, levels: Levels | None) -> TransferDecision:
-        """Return the transfer function: as specified, or by a few views spread over the capture and by the files."""
+        """Return the transfer function that the settings specify.
+
+        Otherwise, estimate it from the files and from a few views that are spread over the capture.
+        """
         several = [view for view in self.views if len(self._of_view[view]) > 1]
         views = several[:: max(1, math.ceil(len(several) / _JUDGED_VIEWS))] or self.views[:1]
         decision = transfer_of_pictures(
@@ -200,7 +209,11 @@ class ShotsSource(Source):
         return decision
 
     def _rounding(self, transfer: str, smallest: float) -> tuple[tuple[int, int], ...]:
-        """Return the rounding of codes: steps of 8-bit values, which grow with sRGB's; no rounding for 16 bits."""
+        """Return the steps to which stored values are rounded.
+
+        8-bit values have steps that grow with the brightness if they are encoded in sRGB. 16-bit values are not
+        rounded.
+        """
         first = self._shots[:1]
         if self._settings.precision == "full" or read_stack(first, self._white).pictures.dtype != np.uint8:
             return tuple(EXACT)
@@ -210,11 +223,11 @@ class ShotsSource(Source):
         return tuple(rounding_of(FULL_CODE * smallest * levels))
 
     def _name(self, path: Path) -> str:
-        """Return a photograph's name in its folder."""
+        """Return the path of a photograph relative to the folder of the capture."""
         return path.relative_to(self._root).as_posix()
 
     def _linear(self, view: str, measured: ShotsMeasured, *, align: bool) -> LinearShots:
-        """Return the linear shots of a view, aligned if ``align`` is True."""
+        """Return the linear shots of a view. They are aligned if ``align`` is True."""
         shots = read_stack(self._of_view[view], self._white, measured.levels)
         if self.used_as_stored(view):
             shots = replace(shots, orientation=1)
@@ -229,7 +242,7 @@ class ShotsSource(Source):
         angles: Sequence[Angle] = ANGLES,
         **measurements: Any,
     ) -> DevelopedView:
-        """Return the view of pictures [K, H, W, 3] in display orientation, with its record."""
+        """Return a developed view from pictures [K, H, W, 3] in display orientation, including its record."""
         height, width = upright.shape[1:3]
         return DevelopedView(
             intensities=np.ascontiguousarray(upright),
@@ -248,7 +261,7 @@ class ShotsSource(Source):
 
 
 class FilterSource(ShotsSource):
-    """Source of four shots per view through a rotating linear polarizer."""
+    """Source of views with four shots each, taken through a rotating linear polarizer."""
 
     kind = "filter"
 
@@ -268,7 +281,7 @@ class FilterSource(ShotsSource):
         super().__init__([path for files in views.values() for path in files], views, settings)
 
     def measure(self, advance: Advance) -> ShotsMeasured:
-        """Determine levels, transfer and exposures of the capture."""
+        """Measure the levels, the transfer function and the exposures of the capture."""
         self._require_memory("four shots")
         settings = self._settings
         gains = settings.calibration.gains
@@ -300,7 +313,11 @@ class FilterSource(ShotsSource):
         )
 
     def develop(self, view: str, measured: ShotsMeasured) -> DevelopedView:
-        """Develop the four shots: validity, transfer, shifts, exposures, gains, sense of the angles, orientation."""
+        """Develop the four shots of a view.
+
+        The steps are: find invalid pixels, linearize, align, correct exposures and gains, correct the sense of the
+        angles, rotate for display.
+        """
         settings = self._settings
         shots = self._linear(view, measured, align=settings.align)
         paths = self._of_view[view]
@@ -348,7 +365,7 @@ class SinglesSource(ShotsSource):
         super().__init__([*itertools.chain(*files.values()), *tables], files, settings)
 
     def measure(self, advance: Advance) -> ShotsMeasured:
-        """Determine levels, transfer and stated exposures of the capture.
+        """Measure the levels and the transfer function of the capture, and read the exposures that files state.
 
         Raises:
             PolarguideError: the photographs are too large, or have different sizes.
@@ -384,7 +401,10 @@ class SinglesSource(ShotsSource):
         )
 
     def develop(self, view: str, measured: ShotsMeasured) -> DevelopedView:
-        """Develop the shots of a view: validity, transfer, shifts of the usual four angles, then orientation."""
+        """Develop the shots of a view.
+
+        The steps are: find invalid pixels, linearize, align shots at the usual four angles, rotate for display.
+        """
         settings = self._settings
         singles = self._singles[view]
         usual = [shot.angle for shot in singles] == list(ANGLES)
@@ -409,7 +429,7 @@ class SinglesSource(ShotsSource):
         return [shot.angle for shot in self._singles[view]]
 
     def _summary(self) -> str:
-        """Return a note on the number of photographs and their angles."""
+        """Return a sentence for the user with the number of photographs and their angles."""
         counts: Counter[Angle] = Counter()
         for shot in itertools.chain(*self._singles.values()):
             angle = turned(shot.angle, self._settings.calibration)
@@ -428,21 +448,28 @@ class SinglesSource(ShotsSource):
 
 Array = NDArray[np.floating[Any]]
 FILE_ERROR = 0.03
-"""Relative error of exposures that files state, because shutters and apertures have nominal values."""
+"""Relative error of exposures that files state. Shutters and apertures deviate from their nominal values."""
 POINTS_ERROR = 0.05
-"""Smallest relative error of exposures from points, because reflections move and polarization looks like exposure."""
+"""Smallest relative error of exposures that are estimated from points.
+
+Moving reflections and polarization change the brightness of a point like an exposure does.
+"""
 LARGEST_DOUBT = 0.5
-"""Logarithm of 0.7 stops. Points that contradict a file by more, and by more than others do, take precedence."""
+"""Largest difference between the logarithms of two exposures of a picture that counts as an error of the points.
+
+It corresponds to 0.7 stops. If the exposure from points differs by more, and by more than in the remaining pictures, it
+replaces the exposure that the file states.
+"""
 
 
 @dataclass(frozen=True, eq=False)
 class Exposures:
-    """Exposures of pictures, and the agreement of their sources.
+    """Combined exposures of pictures, and the agreement between exposures from points and from files.
 
     Attributes:
         logs: logarithms [N] up to a common constant; NaN if unknown.
-        contradicted: indices of pictures whose points contradict their file.
-        scatter: robust standard deviation of the differences between points and files; None without both.
+        contradicted: indices of pictures whose points contradict the exposure that their file states.
+        scatter: robust standard deviation of the differences between points and files. None if one of them is missing.
     """
 
     logs: Array
@@ -453,16 +480,18 @@ class Exposures:
 def reconciled(
     points: Array, files: Array, unfiltered: NDArray[np.bool_], errors: Array | None = None
 ) -> Exposures:
-    """Combine the exposures of points and files.
+    """Combine exposures that are estimated from points with exposures that files state.
 
     Small differences correct the file's value, within its usual error (``FILE_ERROR``) and the agreement of points and
-    files in this capture. Large ones count as errors of the points, unless they exceed ``LARGEST_DOUBT``. Then the
-    points take precedence. The filter absorbs the same share of light in all pictures, which the points determine.
+    files in this capture. Larger differences count as errors of the points. If a difference exceeds ``LARGEST_DOUBT``,
+    the value from points is used instead. The filter absorbs the same share of light in all pictures; this share is
+    estimated from the points.
 
     Args:
-        points, files: logarithms, [N]; NaN if unknown.
+        points: logarithms [N] of exposures from points; NaN if unknown.
+        files: logarithms [N] of exposures from files; NaN if unknown.
         unfiltered: mask [N] of pictures without a filter.
-        errors: standard errors of ``points``, [N]; insignificant differences count as 0.
+        errors: standard errors of ``points``, [N]. Differences within these errors count as 0.
     """
     errors = np.zeros(len(points)) if errors is None else errors
     files = files + np.where(
@@ -490,19 +519,20 @@ def reconciled(
     return Exposures(logs, tuple(int(k) for k in np.flatnonzero(odd)), scatter)
 
 
-# Logarithm of a gain that differs from the others by one and a half stops. It gets a warning if files do not state it.
+# Smallest unusual deviation of a gain's logarithm (1.5 stops). A warning follows unless a file states this gain.
 _FAR = math.log(2.0) * 1.5
 _LISTED = 12
 
 
 @dataclass
 class PictureRow:
-    """A picture of the scene.
+    """One picture of the scene, and the quantities that determine its gain.
 
     Attributes:
-        view: its view. file: its name in ``polar/``.
+        view: name of its view.
+        file: name of its file in ``polar/``.
         record: its record in ``scene.json``.
-        points: number of points at which its view was compared.
+        points: number of points at which its view was compared with other views.
         log: logarithm of its gain.
     """
 
@@ -518,14 +548,16 @@ def write_exposure_table(
 ) -> None:
     """Estimate the gains of all pictures of a written scene, add them to the records, and write ``angles.csv``.
 
-    Shots of one view share one exposure, except for differences that their files state. Gains from the user are kept,
-    and the other gains are scaled to fit them. Otherwise, the geometric mean is 1.
+    Shots of one view have the same exposure unless their files state different exposures. If the user stated gains,
+    they are kept, and the estimated gains are scaled to fit them. Otherwise, the gains have the geometric mean 1.
 
     Args:
-        root: folder of the scene with all views, and the model if there is one. views: its views.
-        gains: auto uses files and, with a model, points; exif uses files only; none sets 1, or keeps stated gains.
-        posed: True with a model.
-        reporter: for messages.
+        root: folder of the scene with all views, and with the COLMAP model if it exists.
+        views: records of the views, by name.
+        gains: "auto" uses files and, if there is a model, points. "exif" uses files only. "none" sets all gains to 1,
+            or keeps gains that the user stated.
+        posed: True if the scene has a model.
+        reporter: receiver of messages.
     """
     pictures = [
         PictureRow(view, Path(name).name, exposure)
@@ -574,7 +606,7 @@ def _estimate(root: Path, pictures: list[PictureRow], posed: bool, reporter: Rep
         numbers = compared.points
         errors = compared.errors
     of_view = np.array([float(np.mean((files - within)[rows[view]])) for view in views])
-    # Views with and without a filter: most of their light passed the filter.
+    # A view that has shots with and without a filter counts as a view with a filter.
     bare = np.array([all(pictures[k].record.angle == "none" for k in rows[view]) for view in views])
     estimate = reconciled(points, of_view, bare, errors)
     finite = np.isfinite(estimate.logs)
@@ -589,12 +621,15 @@ def _estimate(root: Path, pictures: list[PictureRow], posed: bool, reporter: Rep
 
 
 def _within_views(pictures: list[PictureRow], files: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return logarithms of stated exposures relative to the mean of their view; 0 if a file states none."""
+    """Return the logarithm of each picture's stated exposure relative to the mean of its view.
+
+    Return 0 for pictures whose files state no exposure.
+    """
     relative = np.zeros(len(pictures))
     for view in {picture.view for picture in pictures}:
         places = [k for k, picture in enumerate(pictures) if picture.view == view]
         bare = np.array([pictures[k].record.angle == "none" for k in places])
-        # Compared with a shot through the filter, a shot without it gets twice the light at the same exposure.
+        # At the same exposure, a shot without the filter gets twice the light of a shot through the filter.
         extra = np.where(bare & (not bare.all()), math.log(2.0), 0.0)
         logs = files[places] + extra if np.isfinite(files[places]).all() else extra
         relative[places] = logs - logs.mean()
@@ -608,7 +643,7 @@ def _compare_points(
     within: NDArray[np.float64],
     reporter: Reporter,
 ) -> PointExposures | None:
-    """Estimate exposures of views by the model's points; None without tracks."""
+    """Estimate exposures of views from the points of the model. Return None if the model has no tracks."""
     model = read_model(root)
     views = list(rows)
     compared = ComparedPoints.of(model, views)
@@ -637,14 +672,14 @@ def _say_origin(
     unknown: list[str],
     reporter: Reporter,
 ) -> None:
-    """Print the origin of the gains.
+    """Print how the gains were determined.
 
     Args:
-        files: logarithms of the exposures of the views that files state, [V]; NaN if they state none.
+        files: logarithms [V] of the exposures that the files of each view state; NaN if they state none.
         scatter: standard deviation of the differences between points and files, or None.
-        compared: exposures by points, or None.
+        compared: exposures from points, or None.
         unknown: views without a known exposure.
-        reporter: for messages.
+        reporter: receiver of messages.
     """
     count = len(files)
     by_points = 0 if compared is None else int(np.isfinite(compared.logs[:, 0]).sum())
@@ -680,7 +715,7 @@ def _say_origin(
 def _warn(
     contradicted: list[str], pictures: list[PictureRow], files: NDArray[np.float64], reporter: Reporter
 ) -> None:
-    """Warn about unusual exposures."""
+    """Warn about unusual exposures, and about files whose exposures contradict the points."""
     if contradicted:
         reporter.warn(
             f"The brightness of shared points in {len(contradicted)} views contradicts the exposure in their files "
@@ -696,7 +731,10 @@ def _warn(
 
 
 def _say_table(pictures: list[PictureRow], reporter: Reporter) -> None:
-    """Print the table: all pictures, or the most unusual of many; nothing if all gains are 1."""
+    """Print the gains of all pictures, or only the most unusual ones if there are many.
+
+    Print nothing if all gains are 1.
+    """
     if all(picture.record.gain == 1 for picture in pictures):
         return
     listing = pictures

@@ -1,4 +1,4 @@
-"""Record of a preparation, in ``prepare.json`` and at the end in ``scene.json``.
+"""Record of a preparation. It is ``prepare.json`` while the preparation runs, and becomes part of ``scene.json``.
 
 Files are identified by their content, because copies, synchronization and moves change times and paths.
 """
@@ -24,7 +24,7 @@ from polarguide.core.records import read_record
 from polarguide.core.text import canonical
 
 Factor = Annotated[float, Meta(gt=0, le=1e12)]
-"""Positive factor."""
+"""Type of a positive factor."""
 """Positive factor."""
 FourFactors = tuple[Factor, Factor, Factor, Factor]
 _Code = Annotated[int, Meta(ge=0, le=FULL_CODE)]
@@ -33,10 +33,11 @@ StoredRounding = Annotated[tuple[_Multiple, ...], Meta(min_length=1)]
 
 
 class Measured(msgspec.Struct, kw_only=True):
-    """Measurements of a whole capture.
+    """Measurements that all views of a capture share.
 
     Attributes:
-        notes: messages for the user. photographs: geometry of the pictures that structure from motion reads, by view.
+        notes: messages for the user.
+        photographs: sizes and orientations of the pictures that structure from motion reads, by view.
     """
 
     notes: list[str] = []
@@ -44,12 +45,15 @@ class Measured(msgspec.Struct, kw_only=True):
 
 
 class ExposureRecord(msgspec.Struct):
-    """One of the single shots of a view.
+    """Record of one shot of a view.
 
     Attributes:
-        source: name of the file in the capture. angle: angle of the polarizer as displayed.
-        light: exposure that the file states. given_gain: gain that the user stated.
-        gain: gain relative to the other shots. points: number of points by which it was compared.
+        source: name of the file in the capture.
+        angle: angle of the polarizer as displayed.
+        light: exposure that the file states.
+        given_gain: gain that the user stated.
+        gain: gain relative to the remaining shots.
+        points: number of points by which it was compared.
     """
 
     source: str
@@ -61,14 +65,14 @@ class ExposureRecord(msgspec.Struct):
 
 
 class WarpRecord(msgspec.Struct):
-    """Removal of the distortion of a camera: COLMAP's camera model and its parameters."""
+    """Lens distortion that was removed from a view: COLMAP's camera model and its parameters."""
 
     model: str
     parameters: list[float]
 
 
 class ViewRecord(msgspec.Struct, kw_only=True):
-    """Record of a developed view. Fields that its kind of source does not measure are unset."""
+    """Record of a developed view. Fields that the kind of source does not measure are unset."""
 
     orientation: int | UnsetType = UNSET
     shifts: list[tuple[float, float]] | UnsetType = UNSET
@@ -88,15 +92,16 @@ class ViewRecord(msgspec.Struct, kw_only=True):
 
     @property
     def turned(self) -> bool:
-        """True if the view was turned for display."""
+        """True if the view was rotated for display."""
         return self.orientation not in (UNSET, 1)
 
 
 class FileStamp(msgspec.Struct, frozen=True, array_like=True):
-    """Identity of a file.
+    """Identity of a file, to detect whether it has changed.
 
     Attributes:
-        size: bytes. time: of its last change (ns); a file with an equal time keeps its digest.
+        size: size in bytes.
+        time: time of its last change in nanoseconds. If size and time are unchanged, the digest is not computed again.
         digest: SHA-256 of its content; empty in records of earlier versions.
     """
 
@@ -106,11 +111,14 @@ class FileStamp(msgspec.Struct, frozen=True, array_like=True):
 
 
 class Request(msgspec.Struct, omit_defaults=True):
-    """Values that must not change between the calls that write one scene.
+    """Inputs of a preparation, which must stay equal when the preparation is resumed.
 
     Attributes:
-        source: folder of the capture. format: its format. settings: settings as JSON.
-        file: files that are read, by name. model: files of the poses.
+        source: folder of the capture.
+        format: format of the capture.
+        settings: settings as JSON.
+        file: stamps of the files that are read, by name.
+        model: stamps of the files of the poses.
     """
 
     source: str
@@ -124,7 +132,7 @@ M = TypeVar("M")
 
 
 class State(msgspec.Struct, Generic[M]):
-    """Request, measurements and views of a preparation."""
+    """Progress of a preparation: its request, its measurements, and the views that it has written."""
 
     request: Request
     measured: M | None = None
@@ -132,14 +140,14 @@ class State(msgspec.Struct, Generic[M]):
 
 
 class Journal(msgspec.Struct, Generic[M]):
-    """The part of ``prepare.json`` and ``scene.json`` that a preparation reads back."""
+    """Part of ``prepare.json`` and ``scene.json`` that a resumed preparation reads."""
 
     prepare: State[M]
 
 
 _BLOCK = 1 << 20
 _PATHS = ("dark_frame", "analyzers", "angles", "poses", "masks")
-"""Settings that may be paths. Their files are among those of the request."""
+"""Names of settings that may be paths. These files are listed in the request."""
 
 
 def request_of(
@@ -154,9 +162,11 @@ def request_of(
 
     Args:
         root: folder of the capture.
-        earlier: records of earlier calls, which hold digests of unchanged files.
-        kind: format. settings: settings as JSON.
-        paths: files that are read; missing ones are skipped. model: files of the poses.
+        earlier: records of earlier calls, which contain digests of unchanged files.
+        kind: format of the capture.
+        settings: settings as JSON.
+        paths: files that are read; missing files are skipped.
+        model: files of the poses.
     """
     known: Mapping[str, Mapping[str, FileStamp]] = {}
     for record in earlier:
@@ -196,7 +206,10 @@ def _stamps(files: Mapping[str, Path], known: Mapping[str, FileStamp]) -> dict[s
 
 
 def _digest(path: Path) -> str:
-    """Return the SHA-256 of a file; "" for a pipe, a device or an unreadable file, which its reader refuses."""
+    """Return the SHA-256 of a file.
+
+    Return an empty string for a pipe, a device or an unreadable file. Reading such a file fails later with an error.
+    """
     digest = hashlib.sha256()
     if not path.is_file():
         return ""
@@ -210,9 +223,9 @@ def _digest(path: Path) -> str:
 
 
 def changed_entry(before: Request, now: Request) -> tuple[str, str, str] | None:
-    """Return name, old and new value of the first difference between two requests; None for equal ones.
+    """Return the first difference between two requests: its name, the old value and the new value.
 
-    Locations of files do not matter.
+    Return None if the requests are equal. Locations of files are not compared.
     """
     if before.format != now.format:
         return "format", before.format, now.format
@@ -233,7 +246,10 @@ def changed_entry(before: Request, now: Request) -> tuple[str, str, str] | None:
 
 
 def _comparable(files: Mapping[str, FileStamp], *, digests: bool) -> dict[str, Any]:
-    """Return sizes and digests of files by name; without digests sizes and times, by names without folders."""
+    """Return the sizes and digests of files, by name.
+
+    Without digests, return sizes and times, by names without folders.
+    """
     if digests:
         return {name: (stamp.size, stamp.digest) for name, stamp in files.items()}
     named: dict[str, Any] = {}

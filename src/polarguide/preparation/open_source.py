@@ -1,6 +1,6 @@
-"""Detection of the format of a source, and the origin and orientation of its poses.
+"""Detect the format of a capture, and find its poses.
 
-Poses refer to the pictures as stored, or to the pictures that EXIF orientation rotates for display.
+Poses refer to the pictures as stored, or to the pictures after rotation by EXIF orientation. This module decides which.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def _find_masks(folder: Path, views: Sequence[str]) -> dict[str, Path]:
     Masks are named like views, or as in COLMAP and Metashape (``cup.jpg.png``, ``cup_mask.png``).
 
     Raises:
-        PolarguideError: the folder does not exist, or contains no picture with the name of a view.
+        PolarguideError: the folder does not exist, or no picture in it is named like a view.
     """
     if not folder.is_dir():
         raise PolarguideError(
@@ -134,10 +134,10 @@ def _consecutive(
 
     Returns:
         The settings, including a detected number of shots; the shots by view and angle if the angles are the usual
-        four, else None; and notes on assumptions for the user.
+        four, else None; and sentences for the user about assumptions.
 
     Raises:
-        PolarguideError: the size of the groups differs from the number of angles.
+        PolarguideError: the number of pictures in a group differs from the number of angles.
     """
     angles = settings.angles
     if angles is None or angles == "none" or angles.lower().endswith(".csv"):
@@ -150,9 +150,9 @@ def _consecutive(
         if len(stated) not in (1, each):
             raise PolarguideError(
                 "--angles",
-                expected=f"{each} angles, because groups of {each} consecutive pictures show one place",
+                expected=f"{each} angles, because every {each} consecutive pictures show one place",
                 found=angles,
-                remedy="Correct them, or use --shots-per-view 1 if every picture is a view of its own.",
+                remedy="Correct the angles, or use --shots-per-view 1 if every picture is a view of its own.",
             )
         notes = (
             f"Groups of {each} consecutive pictures show one place. Each is one view, named like its first picture "
@@ -177,11 +177,11 @@ def _consecutive(
 
 
 def _require_photographs(root: Path) -> None:
-    """Refuse pictures without angles in their names that may not be ordinary photographs.
+    """Check that pictures without angles in their names are ordinary photographs.
 
     Raises:
-        PolarguideError: the folder contains raw mosaics, gray pictures or no picture; pictures have numbers like
-            angles; or consecutive pictures show one place.
+        PolarguideError: the folder contains raw mosaics, gray pictures or no picture; names of pictures contain numbers
+            that may be angles; or consecutive pictures show one place, as shots through a filter do.
     """
     files = list(index_files(root, SHOT_SUFFIXES).values())
     if not files or index_files(root, tuple(set(RAW_SUFFIXES) - set(SHOT_SUFFIXES))):
@@ -209,9 +209,9 @@ def _require_photographs(root: Path) -> None:
         raise PolarguideError(
             root,
             expected="the angles of shots through a filter",
-            found=f"{len(files)} pictures, of which groups of {each} consecutive ones show one place",
-            remedy=f"Specify the angles in their order, such as --angles {angles} --shots-per-view {each}. Ordinary "
-            "photographs without a filter: --angles none.",
+            found=f"{len(files)} pictures without angles, in which groups of {each} show one place each",
+            remedy=f"Specify the angles in the order of the pictures, such as --angles {angles} --shots-per-view "
+            f"{each}. For ordinary photographs without a filter, use --angles none.",
         )
 
 
@@ -223,13 +223,13 @@ def _is_gray(path: Path) -> bool:
 def frames_of_video(
     root: Path, out: Path, settings: PrepareSettings, reporter: Reporter
 ) -> tuple[Path, PrepareSettings]:
-    """Return the folder of pictures to prepare: ``root``, or the folder of the frames of a video.
+    """Return the folder of pictures to prepare, and the settings. Frames of a video are first written to a folder.
 
-    A folder that contains only a video counts as the video. Frames are written next to ``out``. They are photographs in
-    sRGB unless the settings specify otherwise.
+    A folder whose only file is a video is treated like the video. The frames are written next to ``out``. They are
+    photographs in sRGB unless the settings specify a different encoding.
 
     Raises:
-        PolarguideError: there are several videos, or one cannot be read.
+        PolarguideError: there are several videos, or a video cannot be read.
     """
     videos = find_videos(root)
     if not videos:
@@ -256,10 +256,11 @@ def frames_of_video(
 
 
 def are_single_shots(root: Path, settings: PrepareSettings) -> bool:
-    """Return True if a folder holds photographs through a filter that are not four per view.
+    """Return True if a folder contains single photographs through a filter instead of four shots per view.
 
-    The evidence is a table or an option, an angle other than the four, or one angle per view. Four angles with some
-    missing may be a mistake, which only ``--format singles`` accepts.
+    This holds if there is a table or an option with angles, an angle other than the usual four, or only one angle per
+    view. If only some of the four angles are missing, the result is False, because files may have been forgotten.
+    ``--format singles`` accepts them nevertheless.
     """
     if settings.sensor is not None:
         return False
@@ -275,7 +276,7 @@ def are_single_shots(root: Path, settings: PrepareSettings) -> bool:
 
 
 def _unknown_layout(root: Path) -> PolarguideError:
-    """Return the error for files without a recognizable format. It lists the files and the possible commands."""
+    """Return the error for a folder whose format is not recognized. It lists the files and possible commands."""
     mosaics = index_files(root, RAW_SUFFIXES)
     folders = sorted(path.name for path in root.iterdir() if path.is_dir() and not path.name.startswith("."))
     names = listed(sorted(path.name for path in mosaics.values()))
@@ -312,7 +313,7 @@ POSE_NAMES = (
     "cameras_new.npz",
     "cameras_sphere.npz",
 )
-"""Names of files and folders of poses next to pictures."""
+"""Names of files and folders with poses that may be next to the pictures."""
 
 
 def _source(
@@ -353,11 +354,14 @@ def origin_of_poses(pictures: Source, origin: str) -> str:
 
 
 def known_poses(root: Path, pictures: Source, origin: str, poses_of: str = "auto") -> Poses | None:
-    """Read the poses of a dataset, a file or a folder; None for other origins.
+    """Read poses from a dataset, a file or a folder. Return None if the origin is "sfm" or "none".
 
     Args:
-        root: folder of the capture. pictures: source of the pictures. origin: result of ``origin_of_poses``.
-        poses_of: pixels that the poses refer to. Cameras without a size get the size of these pixels.
+        root: folder of the capture.
+        pictures: source of the pictures.
+        origin: result of ``origin_of_poses``.
+        poses_of: orientation of the pixels that the poses refer to. Cameras without a size get the size of these
+            pixels.
     """
     if origin in ("sfm", "none"):
         return None
@@ -389,7 +393,7 @@ def known_poses(root: Path, pictures: Source, origin: str, poses_of: str = "auto
 
 
 def _notes_of_parts(path: Path, parts: Mapping[str, Path], poses: Poses) -> tuple[str, ...]:
-    """Return notes on the parts of a capture with poses."""
+    """Return sentences for the user about the parts of a capture and their poses."""
     if path.is_dir() and len(parts) > 1:
         note = f"Poses of {listed([file.name for file in parts.values()])}."
         if TEST in parts:
@@ -403,15 +407,15 @@ def _notes_of_parts(path: Path, parts: Mapping[str, Path], poses: Poses) -> tupl
 
 
 CONVENTION = "the convention of COLMAP, Metashape and nerfstudio"
-"""Reason for stored pixels if the sizes of the cameras do not decide."""
+"""Reason for the user why poses refer to stored pixels if the sizes of the cameras do not decide."""
 
 
 def settle_pose_frames(pictures: Source, poses: Poses, frame_given: str) -> str:
-    """Decide which views are used as stored because their poses refer to the stored pixels, and configure the source.
+    """Decide for each view whether its poses refer to the pixels as stored, and configure the source accordingly.
 
     COLMAP, Metashape and nerfstudio read pixels as stored and ignore the orientation tag. Other programs rotate the
-    pictures first. If a quarter turn exchanges width and height, the size of the pose's camera decides. Other views
-    (half a turn, a mirror image, a square) follow the decided ones. The default is the stored orientation.
+    pictures first. If a quarter turn exchanges width and height, the size of the pose's camera decides. The remaining
+    views (half a turn, a mirror image, a square) follow that decision. The default is the stored orientation.
 
     Args:
         pictures: the source, before the first view is developed.
@@ -419,7 +423,7 @@ def settle_pose_frames(pictures: Source, poses: Poses, frame_given: str) -> str:
         frame_given: value of ``--poses-of``.
 
     Returns:
-        A note for the user; empty if no picture has an orientation tag.
+        A sentence for the user; empty if no picture has an orientation tag.
     """
     codes: dict[str, int] = {}
     by_size: dict[str, bool] = {}

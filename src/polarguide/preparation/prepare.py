@@ -1,4 +1,4 @@
-"""Preparation of a scene folder from camera files, with an atomic result and resume after a stop.
+"""Prepare a scene folder from camera files. A stopped preparation can be resumed.
 
 ``prepare.json`` records the request and the written views. ``scene.json`` replaces it as the last file. A folder
 without ``scene.json`` is unfinished, and the same command resumes it.
@@ -86,22 +86,23 @@ REMEDY = "Choose another --out. Nothing was written."
 _LABEL = r"(\d{3}(\.\d+)?|unknown|none)(-\d+)?"
 _POSE_SETTINGS = ("poses", "poses_of", "matching", "sfm_pictures", "intrinsics", "refine_intrinsics", "seed")
 _EARLIER_SETTINGS = {"analyzers": None, "angles": None, "poses_of": "auto", "shots_per_view": None}
-"""Defaults of settings that earlier journals lack."""
+"""Values of settings that were added later, for journals of earlier versions."""
 
 
 class SceneFolder:
-    """An ``--out`` folder, new or resumed."""
+    """Output folder of a preparation, either new or from an unfinished earlier call."""
 
     def __init__(self, root: Path, request: Request, measured_type: type[Measured]) -> None:
         """Open the folder without writing.
 
         Args:
             root: the folder.
-            request: source, files and settings of this call. Poses may be added to a scene without poses.
+            request: source, files and settings of this call. They must equal those of an earlier call, except that
+                poses may be added to a scene without poses.
             measured_type: type of the measurements of the source.
 
         Raises:
-            PolarguideError: the folder contains other files, or the result of another request.
+            PolarguideError: the folder contains other files, or the result of a different request.
         """
         self.root = root
         self.state = State[Any](request)
@@ -124,7 +125,7 @@ class SceneFolder:
             )
 
     def _resume(self, path: Path, request: Request, measured_type: type[Measured]) -> bool:
-        """Read the state of an earlier call; return whether this call adds poses to views without poses."""
+        """Read the state of an earlier call. Return True if this call adds poses to views without poses."""
         content = read_record(path, dict[str, Any])
         if "prepare" not in content:
             raise PolarguideError(
@@ -141,10 +142,10 @@ class SceneFolder:
                 _require_exposures(path, view, record)
         settings = {**_EARLIER_SETTINGS, **before.request.settings}
         now = dict(request.settings)
-        if settings.get("white_balance") == "grey":  # its name in earlier journals
+        if settings.get("white_balance") == "grey":  # spelling in journals of earlier versions
             settings["white_balance"] = "gray"
         if settings.get("matching") == "exhaustive" and now["matching"] == "auto":
-            now["matching"] = "exhaustive"  # the default of earlier journals
+            now["matching"] = "exhaustive"  # default of earlier versions
         follows_none = settings.get("poses") == "none" != now["poses"]
         if follows_none:
             settings |= {name: now[name] for name in _POSE_SETTINGS}
@@ -165,19 +166,19 @@ class SceneFolder:
 
     @property
     def views(self) -> dict[str, ViewRecord]:
-        """Records of the written views."""
+        """Records of the views that have been written, by name."""
         return self.state.views
 
     @property
     def measured(self) -> Measured:
-        """Measurements of the capture."""
+        """Measurements that all views of the capture share."""
         assert self.state.measured is not None
         measured: Measured = self.state.measured
         return measured
 
     @contextlib.contextmanager
     def lock(self) -> Iterator[None]:
-        """Create the folder and lock it.
+        """Create the folder, and lock it against other processes.
 
         Raises:
             PolarguideError: another process holds the lock, or the folder cannot be created.
@@ -191,7 +192,7 @@ class SceneFolder:
             yield
 
     def start(self) -> None:
-        """Write the request."""
+        """Write the request to the journal."""
         work = self.root / SFM
         require_inside(self.root, *(self.root / name for name in (*FOLDERS, PARTIAL, SFM)), *work.rglob("*"))
         if (self.root / SCENE).exists():
@@ -203,7 +204,7 @@ class SceneFolder:
         (self.root / SCENE).unlink(missing_ok=True)
 
     def abandon(self) -> None:
-        """Undo this call: restore a scene without poses, and remove a new folder.
+        """Undo this call: restore a scene without poses, or remove a new folder.
 
         Views from an earlier call remain for the next call.
         """
@@ -229,7 +230,7 @@ class SceneFolder:
         (self.root / JOURNAL).unlink(missing_ok=True)
 
     def has(self, view: str, warp: WarpRecord | None) -> bool:
-        """Return True if the folder contains all files of a view with the same undistortion."""
+        """Return True if the folder contains all files of a view, with the given lens distortion removed."""
         record = self.views.get(view)
         return (
             record is not None
@@ -241,17 +242,17 @@ class SceneFolder:
         )
 
     def drop(self, view: str) -> None:
-        """Remove a view of an earlier call without poses."""
+        """Remove a view that an earlier call wrote without poses."""
         for name in self.views.pop(view).files:
             (self.root / name).unlink(missing_ok=True)
         self.save()
 
 
 def _require_own_files(journal: Path, view: str, files: Iterable[str]) -> None:
-    """Refuse a journal that lists files of other views or folders, because listed files may be removed.
+    """Check that a journal lists only files of the named view. Listed files may be removed later.
 
     Raises:
-        PolarguideError: the journal lists such a file.
+        PolarguideError: the journal lists a file of another view or folder.
     """
     pictures = re.compile(rf"polar/{re.escape(view)}_{_LABEL}\.png")
     own = {f"invalid/{view}.png", f"masks/{view}.png"}
@@ -266,7 +267,7 @@ def _require_own_files(journal: Path, view: str, files: Iterable[str]) -> None:
 
 
 def _require_exposures(journal: Path, view: str, record: ViewRecord) -> None:
-    """Refuse a journal without the exposures of the pictures of a view.
+    """Check that a journal contains the exposures of all pictures of a view.
 
     Raises:
         PolarguideError: exposures are missing.
@@ -283,7 +284,7 @@ def _require_exposures(journal: Path, view: str, record: ViewRecord) -> None:
 
 
 class PoseEstimation:
-    """Estimation of poses and points in a hidden folder of the scene."""
+    """Estimation of camera poses and points, with temporary pictures in a hidden folder of the scene."""
 
     def __init__(
         self, folder: SceneFolder, pictures: Source, settings: PrepareSettings, reporter: Reporter
@@ -295,7 +296,7 @@ class PoseEstimation:
         self._root = folder.root / SFM
 
     def structure(self) -> Path:
-        """Reconstruct all views by structure from motion, and return the folder of the model.
+        """Estimate the poses of all views by structure from motion, and return the folder of the COLMAP model.
 
         Raises:
             PolarguideError: too few views are registered.
@@ -316,7 +317,10 @@ class PoseEstimation:
         )
 
     def points(self, poses: Poses) -> tuple[Poses, dict[str, Any]]:
-        """Triangulate points for given poses; return the poses with points, and a record of the points.
+        """Triangulate points for given poses.
+
+        Returns:
+            The poses with points; and a record of the triangulation.
 
         Raises:
             PolarguideError: the cameras do not look at a common place.
@@ -334,7 +338,7 @@ class PoseEstimation:
         return Poses.read(model, self._pictures.views), record
 
     def _photographs(self, views: list[str]) -> dict[str, Geometry]:
-        """Write tone-mapped pictures and object masks of views, and return the geometry of each view."""
+        """Write tone-mapped pictures and object masks of views. Return size and orientation of each picture."""
         images = self._root / "images"
         masks = self._root / "masks"
         measured = self._folder.measured
@@ -360,7 +364,7 @@ class PoseEstimation:
 
 
 def _untried(settings: PrepareSettings, kind: str) -> str:
-    """Return the options that influence structure from motion, for a message."""
+    """Return the options that may improve structure from motion and were not used, for a message."""
     ways = ["--matching exhaustive (compares all pairs)"] if settings.matching != "exhaustive" else []
     if settings.sfm_pictures != "minimum" and kind != "singles":  # the minimum of one picture is the picture
         ways.append("--sfm-pictures minimum (less glare)")
@@ -371,7 +375,7 @@ def _untried(settings: PrepareSettings, kind: str) -> str:
 
 
 MOSTLY = 0.5
-"""Share of saturated pixels above which a view gets a warning."""
+"""Share of saturated pixels above which a warning about the view is printed."""
 # Largest number of notes on single views that are printed.
 _NOTES = 4
 
@@ -383,8 +387,8 @@ class Prepared:
     Attributes:
         folder: folder of the scene.
         views: names of the views in it.
-        left_out: views without a pose.
-        posed: True with a COLMAP model.
+        left_out: names of views that were left out because they have no pose.
+        posed: True if the scene has a COLMAP model.
         new: True if this call wrote files.
     """
 
@@ -401,19 +405,19 @@ def prepare_scene(
     settings: PrepareSettings | None = None,
     reporter: Reporter | None = None,
 ) -> Prepared:
-    """Write a scene folder from camera files; see docs/reference/formats.md.
+    """Write a scene folder from camera files. docs/reference/formats.md describes its files.
 
-    The same call resumes a stopped one. Only unfinished work of the same request is replaced.
+    If a call was stopped, the same call resumes it. Files of a different request are never replaced.
 
     Args:
         source: folder of raw mosaics, of filter shots, or of single shots; or a video.
-        out: scene folder: new, empty, or of the same request.
+        out: scene folder. It is new, empty, or contains the unfinished result of an equal call.
         settings: settings of the preparation.
-        reporter: receives messages and progress.
+        reporter: receiver of messages and progress.
 
     Raises:
         PolarguideError: the source or a setting is invalid, ``out`` contains other files, or structure from motion does
-            not connect the views. Then this call leaves no files in ``out``.
+            not connect the views. In the last case, this call leaves no files in ``out``.
     """
     reporter = reporter or Reporter()
     target = Path(out)
@@ -483,7 +487,7 @@ def _write_scene(
     poses: Poses | None,
     reporter: Reporter,
 ) -> Prepared:
-    """Write the missing parts of a measured scene."""
+    """Write the missing parts of a scene whose capture has been measured."""
     tests = () if poses is None else poses.held_out
     folder.start()
     work = PoseEstimation(folder, pictures, settings, reporter)
@@ -528,7 +532,7 @@ def _write_scene(
 
 
 def _without_poses(root: Path, pictures: Source, settings: PrepareSettings) -> str:
-    """Return the remedy for a capture without poses: commands for views without poses."""
+    """Return the remedy for a capture whose poses cannot be estimated. It contains commands that need no poses."""
     out = f"--out {shlex.quote(root.resolve().name + '-priors')}"
     if pictures.kind == "singles":
         return "--poses none develops the photographs without poses."
@@ -573,7 +577,7 @@ def _write_views(folder: SceneFolder, pictures: Source, poses: Poses | None, rep
 
 
 def _shorten(texts: list[str], others: str) -> list[str]:
-    """Return the first texts, and a sentence on the number of others."""
+    """Return the first texts. If there are more, add a sentence with their number."""
     rest = len(texts) - _NOTES
     more = [f"{rest} more {others}. {SCENE} lists their figures."] if rest > 0 else []
     return [*texts[:_NOTES], *more]
@@ -582,7 +586,11 @@ def _shorten(texts: list[str], others: str) -> list[str]:
 def _write_view(
     folder: SceneFolder, pictures: Source, view: str, poses: Poses | None
 ) -> tuple[list[str], tuple[str, ...]]:
-    """Write the pictures of a view; return its faults and the notes about it."""
+    """Write the pictures of a view.
+
+    Returns:
+        Faults of the view; and notes about it for the user.
+    """
     done = develop_view(pictures, view, folder.measured)
     intensities = done.intensities
     invalid = done.invalid
@@ -614,27 +622,27 @@ def _write_view(
 
 
 def _warp_record(warp: Undistortion) -> WarpRecord | None:
-    """Return the record of an undistortion; None without distortion."""
+    """Return the record of a removed lens distortion, or None if the lens has no distortion."""
     record = warp.record()
     return None if record is None else WarpRecord(**record)
 
 
 def _turns(folder: SceneFolder) -> str:
-    """Return a note on the views that were rotated for display; empty without such views."""
+    """Return a note on the views that were rotated for display. The note is empty if there are no such views."""
     records = [record for record in folder.views.values() if record.turned]
     if not records:
         return ""
     counts = sorted(Counter(int(record.orientation or 1) for record in records).items())
     turned = listed([f"{count} {TURNS[code]}" for code, count in counts])
     noted = [shot.angle for record in records for shot in record.exposures or ()]
-    # Shots of a view at the usual four angles have no list of exposures.
+    # The list is empty if all views have shots at the usual four angles.
     angles = not noted or any(not isinstance(angle, str) for angle in noted)
     also = ", including their polarizer angles" if angles else ""
     return f"EXIF orientation: {len(records)} of {len(folder.views)} views were rotated for display{also} ({turned})."
 
 
 def _write_model(folder: SceneFolder, poses: Poses) -> None:
-    """Replace the model in one step, after reading it back."""
+    """Write the COLMAP model, validate it by reading it, and then replace the old model in one step."""
     partial = folder.root / PARTIAL
     final = folder.root / "sparse"
     for old in (partial, final):
@@ -652,7 +660,10 @@ def _write_model(folder: SceneFolder, poses: Poses) -> None:
 def _summary(
     folder: SceneFolder, pictures: Source, settings: PrepareSettings, points: dict[str, Any] | None
 ) -> dict[str, Any]:
-    """Return the notes in ``scene.json`` for readers; "prepare" contains everything else."""
+    """Return the part of ``scene.json`` that describes the scene to users.
+
+    All remaining values of the preparation are in its entry "prepare".
+    """
     measured = msgspec.to_builtins(folder.measured)
     for name in ("photographs", "light"):
         measured.pop(name, None)

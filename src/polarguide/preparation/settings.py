@@ -30,7 +30,7 @@ from polarguide.geometry.polarizer import ANGLES
 
 Dataset = Literal["pandora", "pisr", "nersp", "neisf", "gnerp", "phygap"]
 ORIGINS = ("auto", "dataset", "sfm", "none")
-"""Values of ``poses`` that are not paths."""
+"""Allowed values of the setting ``poses``, apart from paths."""
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ _KINDS: dict[str, type[GainOptions]] = {
 }
 """Types of settings by the names of the sources in messages."""
 _NAMES = {"mosaic": "raw mosaics", "filter": "rotating filters", "singles": "single shots"}
-"""Names of formats in messages, where they differ from the formats."""
+"""Names of formats in messages, for formats whose names are not clear to users."""
 
 
 @dataclass(frozen=True)
@@ -151,8 +151,8 @@ class PrepareSettings(RawOptions, MosaicSettings, SinglesSettings):
         if self.shots_per_view is not None and self.angles is None:
             raise PolarguideError(
                 "--shots-per-view",
-                expected="--angles with the angles of the shots of a view in their order, or a word",
-                found="none",
+                expected="the angles of the shots of each view in --angles, or --angles unknown or none",
+                found="no --angles",
                 remedy="Specify both, such as --angles 0,45,90,135 --shots-per-view 4.",
             )
         if self.intrinsics is not None:
@@ -162,7 +162,7 @@ class PrepareSettings(RawOptions, MosaicSettings, SinglesSettings):
                 "--refine-intrinsics",
                 expected="initial values in --intrinsics",
                 found="no --intrinsics",
-                remedy="Omit it: unknown intrinsics are always estimated.",
+                remedy="Remove the option: unknown intrinsics are always estimated.",
             )
         return replace(
             self,
@@ -231,10 +231,10 @@ class CalibrationOptions:
 
 
 def settings_of_format(settings: PrepareSettings, kind: str) -> GainOptions:
-    """Return the settings that apply to a format, as the type of that format.
+    """Return the settings that apply to a format, as the settings type of that format.
 
     Raises:
-        PolarguideError: another setting differs from its default.
+        PolarguideError: a setting that does not apply differs from its default.
     """
     owner = _KINDS.get(_NAMES.get(kind, kind), GainOptions)
     for name, owners in sorted(misplaced(settings, owner, _KINDS)):
@@ -243,13 +243,13 @@ def settings_of_format(settings: PrepareSettings, kind: str) -> GainOptions:
             option_name(name),
             expected=f"only options of the format {kind}",
             found=f"an option of {', '.join(others)} and {last}" if others else f"an option of {last}",
-            remedy="Omit it, or choose another --format.",
+            remedy="Remove the option, or choose another --format.",
         )
     calibration = settings.calibration
     if kind == "singles" and (calibration.gains is not None or calibration.order != ANGLES):
         raise PolarguideError(
             "calibration (gains, order)",
-            expected="only sense and zero for single shots",
+            expected="only sense and zero in the calibration of single shots",
             found=f"gains {calibration.gains}, order {calibration.order}",
             remedy="List the angle and gain of every shot in angles.csv.",
         )
@@ -264,10 +264,12 @@ def settings_of_format(settings: PrepareSettings, kind: str) -> GainOptions:
 
 
 def white_gains(text: str) -> tuple[float, float, float] | None:
-    """Parse the gains of R, G and B from ``--white-balance``; None for "gray", which needs the pictures.
+    """Parse the gains of R, G and B from ``--white-balance``.
+
+    Return None for "gray", whose gains are measured in the pictures.
 
     Raises:
-        PolarguideError: the text has another form.
+        PolarguideError: the text is invalid.
     """
     if text in ("none", "gray", "grey"):
         return (1.0, 1.0, 1.0) if text == "none" else None
@@ -283,10 +285,14 @@ def white_gains(text: str) -> tuple[float, float, float] | None:
 
 
 def known_intrinsics(text: str) -> tuple[str, tuple[float, ...]]:
-    """Parse COLMAP's camera model and parameters from ``--intrinsics``: PINHOLE with four numbers, OPENCV with eight.
+    """Parse the camera intrinsics in ``--intrinsics``.
+
+    Returns:
+        The name of COLMAP's camera model; and its parameters. The model is PINHOLE for four numbers, and OPENCV for
+        eight.
 
     Raises:
-        PolarguideError: the text has another form.
+        PolarguideError: the text is invalid.
     """
     numbers = decimals(text)
     if len(numbers) not in (4, 8) or not all(map(math.isfinite, numbers)) or min(numbers[:4]) <= 0:

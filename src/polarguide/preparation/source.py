@@ -1,4 +1,4 @@
-"""Interface of picture sources, and the sources of Stokes vectors and raw mosaics."""
+"""Interface of picture sources, and the sources for Stokes vectors and for raw mosaics."""
 
 from __future__ import annotations
 
@@ -53,14 +53,15 @@ from polarguide.preparation.settings import MosaicSettings, white_gains
 
 @dataclass(frozen=True, eq=False)
 class DevelopedView:
-    """The developed picture of one view.
+    """Developed pictures of one view.
 
     Attributes:
-        intensities: [4, H, W, 3] float32 in [0, 1], linear, at 0, 45, 90 and 135 degrees; or [K, H, W, 3].
-        invalid: pixels that depend on an unusable sample, [H, W].
-        mask: object mask, [H, W], or None.
+        intensities: [4, H, W, 3] float32 in [0, 1], linear, at 0, 45, 90 and 135 degrees. For other angles [K, H, W,
+            3].
+        invalid: mask [H, W] of pixels that depend on an unusable sample.
+        mask: object mask [H, W], or None.
         angles: angles of the pictures, counter-clockwise as displayed.
-        record: record of the view; ``geometry`` is part of it.
+        record: record of the view, including its ``geometry``.
         notes: messages for the user.
     """
 
@@ -77,8 +78,8 @@ class Stored:
     """Size and orientation of a view's pictures as stored.
 
     Attributes:
-        size: width and height of the stored pixels; None if no header states them.
-        orientation: EXIF orientation, 1 to 8; 1 is as stored.
+        size: width and height of the stored pixels. None if no header states them.
+        orientation: EXIF orientation, 1 to 8. 1 means no rotation.
         developed: width and height of the developed picture if it is smaller, else None.
     """
 
@@ -88,7 +89,7 @@ class Stored:
 
     @property
     def sizes(self) -> tuple[tuple[int, int], ...]:
-        """Possible sizes of the camera of a view: stored, rotated and developed."""
+        """Sizes that the camera of a view may have: stored, rotated and developed."""
         if self.size is None:
             return ()
         turned = (self.size[::-1],) if self.orientation in QUARTER_TURNS else ()
@@ -96,14 +97,14 @@ class Stored:
 
 
 class Source(Protocol):
-    """Pictures of one capture.
+    """Base class for the pictures of one capture.
 
     Attributes:
         kind: name of the format.
-        cameras: cameras by view name, or None for a source without poses.
+        cameras: cameras by view name. None for a source without poses.
         views: view names, sorted.
         paths: all files that are read except masks.
-        masks: object masks of the user by view; values of at least half of the maximum are object.
+        masks: object masks of the user by view. Values of at least half of the maximum mark the object.
         measured_type: type of the result of ``measure``.
     """
 
@@ -115,35 +116,35 @@ class Source(Protocol):
     masks: Mapping[str, Path] = MappingProxyType({})
 
     def measure(self, advance: Advance) -> Measured:
-        """Measure the common properties of the capture."""
+        """Measure the properties that all views of the capture share."""
 
     def develop(self, view: str, measured: Any) -> DevelopedView:
-        """Read one view."""
+        """Read and develop one view."""
 
     def stored(self, view: str) -> Stored:
-        """Return stored size and orientation of a view's pictures, from the header of its first file."""
+        """Return size and orientation of a view's pictures as stored, from the header of its first file."""
 
     def lenses(self) -> dict[str, Lens]:
-        """Return the lens of each view if the files state several, else an empty dictionary."""
+        """Return the lens of each view if the files state different lenses, else an empty dictionary."""
         return {}
 
     def use_stored(self, views: Collection[str]) -> None:
-        """Develop these views as stored, without their orientation. The call must precede ``develop``.
+        """Develop some views as stored, without applying their orientation tags. Call this before ``develop``.
 
-        By default, files have no orientation.
+        The base class does nothing, because its files have no orientation.
         """
         return None
 
     def used_as_stored(self, view: str) -> bool:
-        """Return True if ``use_stored`` contains a view."""
+        """Return True if a view is developed as stored, because ``use_stored`` selected it."""
         return False
 
 
 def develop_view(pictures: Source, view: str, measured: Measured) -> DevelopedView:
-    """Return the result of ``Source.develop``, with the view's mask.
+    """Develop a view with ``Source.develop``, and add its mask.
 
     Raises:
-        PolarguideError: the mask cannot be read, or has another size than the stored and the developed picture.
+        PolarguideError: the mask cannot be read. Or its size differs from both the stored and the developed picture.
     """
     done = pictures.develop(view, measured)
     if view not in pictures.masks:
@@ -154,13 +155,14 @@ def develop_view(pictures: Source, view: str, measured: Measured) -> DevelopedVi
 
 
 def _fit_mask(path: Path, view: DevelopedView, code: int) -> NDArray[np.bool_]:
-    """Return a mask at the size of the developed picture: True if at least half of a pixel is object.
+    """Return a mask at the size of the developed picture. A pixel is True if at least half of it shows the object.
 
-    A mask with exchanged width and height is oriented like the picture.
+    If the mask has exchanged width and height, it is rotated like the picture.
 
     Args:
-        path: file of the mask. view: the developed picture.
-        code: EXIF orientation from the other orientation of the picture to the used one.
+        path: file of the mask.
+        view: the developed picture.
+        code: EXIF orientation that rotates a mask with exchanged width and height to the picture.
     """
     mask = read_mask(path)
     geometry = view.record.geometry
@@ -196,12 +198,15 @@ _WORKED = 4 * 3 * (3 + 3 + 4 + 4)
 
 
 class StokesMeasured(Measured, kw_only=True):
-    """Measurements of Stokes vectors.
+    """Measurements that all Stokes vectors of a capture share.
 
     Attributes:
-        scale: factor of the dataset's intensities. full_scale: the dataset's intensity that becomes 1.
-        negative_share: share of negative intensities. not_finite_share: share of pixels that are not finite.
-        pair_sums: result of the four-angle sum check. sense: sense of the angles.
+        scale: factor of the dataset's intensities.
+        full_scale: intensity of the dataset that becomes 1.
+        negative_share: share of negative intensities.
+        not_finite_share: share of pixels that are not finite.
+        pair_sums: comparison of I0 + I90 with I45 + I135.
+        sense: direction in which the angles increase.
     """
 
     scale: Factor
@@ -213,12 +218,12 @@ class StokesMeasured(Measured, kw_only=True):
 
 
 class StokesSource(Source):
-    """Source of Stokes vectors in any unit, without a full scale."""
+    """Source of a dataset that contains Stokes vectors in any unit, without a stated full scale."""
 
     measured_type = StokesMeasured
 
     def __init__(self, dataset: Dataset, settings: CameraOptions) -> None:
-        """Use a dataset with ``read_stokes``; its sense of angles is the default."""
+        """Use a dataset that has ``read_stokes``. By default, the angles increase in the direction that it states."""
         self.kind = dataset.name
         self.cameras = dataset.cameras
         self.views = dataset.views
@@ -229,11 +234,11 @@ class StokesSource(Source):
         self._calibration = replace(calibration, sense=calibration.sense or dataset.sense)
 
     def stored(self, view: str) -> Stored:
-        """Return the size from the header of a file with the size of the Stokes vectors."""
+        """Return the size of a view, from the header of one of its files."""
         return Stored(stated_size(self._dataset.files[view]))
 
     def measure(self, advance: Advance) -> StokesMeasured:
-        """Determine one scale for the whole capture, and the share of clipped pixels; every file is read once.
+        """Determine one scale for the whole capture, and the share of clipped pixels. Each file is read once.
 
         The largest intensity becomes 1 if it is at most twice the 99.9th percentile. Otherwise, twice this percentile
         becomes 1, and larger intensities clip.
@@ -290,7 +295,10 @@ class StokesSource(Source):
         )
 
     def develop(self, view: str, measured: StokesMeasured) -> DevelopedView:
-        """Read one view, scale it, form the four intensities and correct the sense of the angles."""
+        """Read and scale the Stokes vectors of a view, and compute its four intensities.
+
+        The direction of the angles is corrected.
+        """
         stokes, finite, clipped = self._stokes(view)
         intensities = np.stack(four_intensities(stokes * np.float32(measured.scale)))
         # Rounding of the scale can move the largest intensity slightly above 1.
@@ -310,7 +318,7 @@ class StokesSource(Source):
         )
 
     def _settle_sense(self, outlines: list[OutlineAgreement]) -> tuple[Sense, str]:
-        """Return the sense of the angles and a note with the reason; warn if the sense is doubtful."""
+        """Return the direction in which the angles increase, and the reason. Warn if the direction is doubtful."""
         sense = self._calibration.sense or "ccw"
         light_sense = sense_of_outlines(outlines)
         stated = self._given_sense is not None or self._dataset.sense_known
@@ -342,7 +350,12 @@ class StokesSource(Source):
         return sense, note
 
     def _stokes(self, view: str) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.bool_]]:
-        """Return Stokes vectors [3, H, W, 3] with 0 for invalid values, and masks of finite and of clipped pixels."""
+        """Read the Stokes vectors of a view.
+
+        Returns:
+            Stokes vectors [3, H, W, 3] with 0 for invalid values; mask [H, W] of finite pixels; and mask of clipped
+            pixels.
+        """
         assert self._dataset.read_stokes is not None
         stokes, clipped = self._dataset.read_stokes(view)
         finite = np.asarray(np.isfinite(stokes).all(axis=(0, 3)))
@@ -360,13 +373,19 @@ _GAINS = {
 
 
 class MosaicMeasured(Measured, kw_only=True):
-    """Measurements of the mosaics of a capture.
+    """Measurements that all mosaics of a capture share.
 
     Attributes:
-        levels: levels of the stored values. pattern: rows of the sensor's pattern. crop: columns and rows cut off.
-        pair_ratio: ratio of the pair sums. gains: gains of the four angles. white_balance: gains of R, G and B.
-        analyzers: calibration of the sensor. scale: factor of the linear values.
-        rounding: rounding of codes. defects: number of defective samples.
+        levels: black level and full scale of the stored values.
+        pattern: rows of the sensor's pattern.
+        crop: numbers of columns and rows that are cut off.
+        pair_ratio: ratio of I0 + I90 to I45 + I135.
+        gains: gains of the four angles.
+        white_balance: gains of R, G and B.
+        analyzers: calibration of the sensor.
+        scale: factor of the linear values.
+        rounding: steps to which stored values are rounded.
+        defects: number of defective samples.
     """
 
     levels: Levels
@@ -382,12 +401,12 @@ class MosaicMeasured(Measured, kw_only=True):
 
 
 class MosaicSource(Source):
-    """Source of raw mosaics of a division-of-focal-plane sensor."""
+    """Source of raw mosaics of a polarization camera, whose pixels have polarizers at four angles."""
 
     measured_type = MosaicMeasured
 
     def __init__(self, root: Path, settings: MosaicSettings, dataset: Dataset | None = None) -> None:
-        """Find the files.
+        """Find the mosaics of a folder.
 
         Args:
             root: the folder of mosaics.
@@ -418,11 +437,11 @@ class MosaicSource(Source):
                 "--white-balance",
                 expected="none for a monochrome sensor",
                 found=settings.white_balance,
-                remedy="Omit it.",
+                remedy="Remove the option.",
             )
 
     def stored(self, view: str) -> Stored:
-        """Return the size from the header of the mosaic, or from the settings."""
+        """Return the size of a view, from the header of its mosaic or from the settings."""
         settings = self._settings
         size = stated_size(self._files[view])
         if size is None and settings.width is not None and settings.height is not None:
@@ -438,7 +457,7 @@ class MosaicSource(Source):
         return Stored(size, developed=(across, down))
 
     def measure(self, advance: Advance) -> MosaicMeasured:
-        """Measure levels, gains of the angles and white balance of the capture; every file is read once."""
+        """Measure levels, gains of the angles and white balance of the capture. Each file is read once."""
         counts = np.zeros(FULL_16 + 1, np.int64)
         container = 0
         shape = None
@@ -511,7 +530,10 @@ class MosaicSource(Source):
         )
 
     def _defects(self, levels: Levels) -> NDArray[np.bool_]:
-        """Return a mask of defective samples of a mosaic cropped to whole cells, without saturated ones."""
+        """Return a mask of defective samples.
+
+        The mosaic is cropped to whole cells of the pattern. Saturated samples do not count as defects.
+        """
         if self._defective is None:
             files = list(self._files.values())
             sample = files[:: max(1, math.ceil(len(files) / _JUDGED))]
@@ -522,7 +544,11 @@ class MosaicSource(Source):
         return self._defective
 
     def develop(self, view: str, measured: MosaicMeasured) -> DevelopedView:
-        """Develop one mosaic: validity, levels, gains, demosaicing, and the sense of the angles."""
+        """Develop one mosaic.
+
+        The steps are: find invalid samples, correct levels and gains, demosaic, and correct the direction of the
+        angles.
+        """
         stored = self._mosaics.read(self._files[view])
         dark = self._mosaics.dark(stored.shape)
         values = self._mosaics.cut(stored)

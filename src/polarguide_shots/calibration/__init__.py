@@ -1,1 +1,1 @@
-"""Calibration of a polarization sensor: analyzer vectors from shots of a polarizer in front of a uniform light."""
+"""Calibrate a polarization sensor with shots of a polarizer in front of a uniform light."""

@@ -1,4 +1,7 @@
-"""Calibration of a sensor: analyzer vectors of pixels or blocks from shots of a polarizer."""
+"""Calibrate a polarization sensor with shots of a polarizer.
+
+The result is an analyzer vector for each pixel or block of pixels. It maps a Stokes vector to the measured intensity.
+"""
 
 from __future__ import annotations
 
@@ -30,13 +33,13 @@ from polarguide_shots.calibration.settings import CalibrateSettings
 from polarguide_shots.calibration.shots import ShotFit, ShotMeans, Shots, solve_shots
 
 BLOCK = 32
-"""Default side of a block in pixels."""
+"""Default width of the square blocks that share an analyzer vector, in pixels."""
 NEIGHBORHOOD = 31
-"""Side of the neighborhood that determines the brightness of the light, in cells of one color."""
+"""Width of the square from which the brightness of the light is estimated, in cells of one color."""
 LEAST_THROUGHPUT = 0.5
-"""Smallest throughput of a polarizer without a defect."""
+"""Smallest relative throughput of a polarizer without a defect."""
 MOST_THROUGHPUT = 1.5
-"""Largest throughput of a polarizer without a defect."""
+"""Largest relative throughput of a polarizer without a defect."""
 MOST_DIATTENUATION = 1.3
 """Largest diattenuation of a polarizer without a defect."""
 
@@ -45,11 +48,12 @@ Array = NDArray[np.float32]
 
 @dataclass(frozen=True, eq=False)
 class AnalyzerFit:
-    """Analyzer vectors of single pixels.
+    """Analyzer vectors that are fitted to single pixels.
 
     Attributes:
-        vectors: [H, W, 3]; the local mean of the first components of a color is 1/2.
-        noise: variance of a vector by the deviations of its shots, summed over components, averaged over pixels.
+        vectors: [H, W, 3]. The first components of a color have a local mean of 1/2.
+        noise: variance of a vector, estimated from the residuals of its shots. It is summed over components and
+            averaged over pixels.
         defects: mask [H, W] of the pixels without a plausible polarizer.
     """
 
@@ -60,12 +64,12 @@ class AnalyzerFit:
 
 @dataclass(frozen=True)
 class BlockChoice:
-    """Size of the blocks that share a vector.
+    """Chosen size of the blocks that share an analyzer vector.
 
     Attributes:
-        block: side of a block in pixels; the period of the pattern for single pixels.
-        noise: standard deviation of a pixel's vector by noise, as a share of its throughput.
-        scatter: standard deviation of the vectors within a block without noise, as a share of their throughput.
+        block: width of a block in pixels. For single pixels, it is the period of the pattern.
+        noise: standard deviation of a pixel's vector because of noise, as a share of its throughput.
+        scatter: standard deviation of the true vectors within a block, as a share of their throughput.
     """
 
     block: int
@@ -78,7 +82,7 @@ def fit_pixels(
     light: NDArray[np.float64],
     pattern: Pattern,
 ) -> AnalyzerFit:
-    """Fit the vector of each pixel.
+    """Fit the analyzer vector of each pixel.
 
     Args:
         shots: linear intensities [H, W] of each shot, and a mask [H, W] of saturated samples.
@@ -106,7 +110,12 @@ def fit_pixels(
 
 
 def plausible(vectors: Any, nominal: Any) -> NDArray[np.bool_]:
-    """Return a mask of vectors [..., 3] that are plausible for polarizers near their nominal angles in radians."""
+    """Return a mask of the analyzer vectors that a polarizer without a defect may have.
+
+    Args:
+        vectors: analyzer vectors [..., 3].
+        nominal: nominal angles of the polarizers in radians.
+    """
     gain = 2 * vectors[..., 0]
     strength = 2 * np.hypot(vectors[..., 1], vectors[..., 2])
     cosine = vectors[..., 1] * np.cos(2 * nominal) + vectors[..., 2] * np.sin(2 * nominal)
@@ -122,13 +131,15 @@ def plausible(vectors: Any, nominal: Any) -> NDArray[np.bool_]:
 def choose_block(
     pixels: AnalyzerFit, offset: tuple[int, int], pattern: Pattern, specified: int | None
 ) -> BlockChoice:
-    """Choose the size of blocks: single pixels if their noise is less than the scatter within blocks.
+    """Choose the size of the blocks that share an analyzer vector.
+
+    Single pixels are chosen if their noise is less than the scatter of the vectors within a block.
 
     Args:
         pixels: vectors of single pixels.
         offset: column and row of the first sample in the sensor.
         pattern: pattern of the region.
-        specified: side of a block according to the user, or None.
+        specified: width of a block that the user specified, or None.
     """
     around = _neighborhoods(pixels, offset, pattern)
     deviation = (pixels.vectors - around).astype(np.float64)
@@ -149,14 +160,14 @@ def choose_block(
 
 
 def shared(pixels: AnalyzerFit, offset: tuple[int, int], block: int, pattern: Pattern) -> Array:
-    """Return the vectors of the file, means over blocks without defects.
+    """Return the analyzer vectors of the calibration file. They are means over blocks, without defective pixels.
 
-    With single pixels, a defect gets the mean of its neighborhood.
+    If a block is a single pixel, a defective pixel gets the mean of its neighborhood.
 
     Args:
         pixels: vectors of single pixels.
         offset: column and row of the first sample in the sensor.
-        block: side of a block in pixels.
+        block: width of a block in pixels.
         pattern: pattern of the region.
 
     Returns:
@@ -170,9 +181,9 @@ def shared(pixels: AnalyzerFit, offset: tuple[int, int], block: int, pattern: Pa
 
 
 def block_means(pixels: AnalyzerFit, offset: tuple[int, int], block: int, pattern: Pattern) -> Array:
-    """Return the mean vectors of blocks by position in the pattern; the mean over the sensor for a block of defects.
+    """Return the mean vectors of blocks, for each position in the pattern.
 
-    Args and result are those of ``shared``.
+    If all pixels of a block are defective, it gets the mean over the sensor. Arguments and result are as in ``shared``.
     """
     height, width, _ = pixels.vectors.shape
     period = pattern.period
@@ -193,7 +204,7 @@ def block_means(pixels: AnalyzerFit, offset: tuple[int, int], block: int, patter
 
 
 def _neighborhoods(pixels: AnalyzerFit, offset: tuple[int, int], pattern: Pattern) -> Array:
-    """Return the mean vector of the block around each pixel, [H, W, 3]."""
+    """Return for each pixel the mean vector of the block that contains it, [H, W, 3]."""
     means = block_means(pixels, offset, BLOCK, pattern)
     y = np.arange(pixels.vectors.shape[0]) + offset[1]
     x = np.arange(pixels.vectors.shape[1]) + offset[0]
@@ -206,10 +217,11 @@ def _neighborhoods(pixels: AnalyzerFit, offset: tuple[int, int], pattern: Patter
 def _brightness(throughput: NDArray[np.float64], pattern: Pattern) -> NDArray[np.float64]:
     """Fit a smooth surface to the brightness of each color, [H, W].
 
-    The surface is a plane over a cell. An illumination that is not uniform therefore does not look like polarization.
+    The surface is a plane over each cell. Without this fit, an illumination that is not uniform would look like
+    polarization.
 
     Args:
-        throughput: [H, W].
+        throughput: throughput of the pixels, [H, W].
         pattern: pattern of the region.
     """
     left, top = pattern.cell_corner()
@@ -234,12 +246,12 @@ def _brightness(throughput: NDArray[np.float64], pattern: Pattern) -> NDArray[np
 def _at_places(
     cells: NDArray[np.float64], corner: tuple[int, int], step: int, shape: tuple[int, ...]
 ) -> NDArray[np.float64]:
-    """Interpolate values of cells of 2x2 pixels at all pixels.
+    """Interpolate values of cells at all pixels. A cell has 2x2 pixels.
 
     Args:
         cells: values of the cells.
         corner: column and row of the first cell.
-        step: distance of cells in pixels.
+        step: distance between two cells in pixels.
         shape: rows and columns of the result.
     """
     x = ((np.arange(shape[1]) - corner[0] - 0.5) / step).astype(np.float32)
@@ -250,7 +262,10 @@ def _at_places(
 
 
 def _smooth(values: NDArray[np.float64], side: int) -> NDArray[np.float64]:
-    """Fit a plane to the square around each value, and return its value in the middle. Squares are smaller at edges."""
+    """Smooth values by fitting a plane to the square around each value.
+
+    The result is the value of the plane at the center. Squares are smaller at the edges.
+    """
     y, x = np.mgrid[: values.shape[0], : values.shape[1]].astype(np.float64)
 
     def box(plane: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -272,9 +287,9 @@ def _smooth(values: NDArray[np.float64], side: int) -> NDArray[np.float64]:
 
 
 MOST_DEFECTS = 0.05
-"""Largest share of pixels without a plausible polarizer for valid settings and shots."""
+"""Largest share of defective pixels in a plausible calibration. A larger share indicates wrong settings or shots."""
 DOUBTFUL = 0.005
-"""Misfit, or DoLP of a flat field, above which a warning is given. The DoLP has errors of this size."""
+"""Smallest misfit, or DoLP of a flat field, that causes a warning. The DoLP has errors of this size."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -282,13 +297,13 @@ class Calibrated:
     """Result of a calibration.
 
     Attributes:
-        path: path of the calibration.
-        picture: path of the PNG next to it.
-        calibration: content of the file.
-        positions: figures of the positions.
-        shots: angles and levels of the shots.
+        path: path of the calibration file.
+        picture: path of the PNG file next to it.
+        calibration: content of the calibration file.
+        positions: properties of the polarizers at each position of the pattern.
+        shots: angles and brightness of the shots.
         choice: size of the blocks.
-        defects: number of pixels without a plausible polarizer, which got the vector of their block.
+        defects: number of pixels without a plausible polarizer. They got the vector of their block.
     """
 
     path: Path
@@ -305,13 +320,13 @@ def calibrate_sensor(
 ) -> Calibrated:
     """Estimate the analyzer vectors of a sensor (superpixel calibration, Powell and Gruev 2013).
 
-    Means over the sensor determine angles and levels of the shots. Linear least squares of its own intensities then
-    determine the vector of each pixel. A common factor of neighboring pixels (light, vignetting) is not part of the
-    vectors.
+    First, the means over the sensor give the angle and brightness of each shot. Then linear least squares gives the
+    vector of each pixel from its own intensities. A factor that neighboring pixels have in common (light, vignetting)
+    is removed from the vectors.
 
     Args:
         source: folder of mosaics of a linear polarizer in front of a uniform light, at five or more angles.
-        out: file to write, ``.safetensors``; a picture of the same name is written next to it.
+        out: file to write, ``.safetensors``. A picture of the same name is written next to it.
         settings: settings of the shots and the calibration.
         reporter: receiver of progress and messages.
 
@@ -362,7 +377,9 @@ def calibrate_sensor(
 
 
 def _require_new(out: Path, shots: Path, settings: CalibrateSettings) -> None:
-    """Check that the files of the output are new, and not in a folder of shots, where the next call would read them.
+    """Check that the output files do not exist, and are not in a folder of shots.
+
+    The next calibration would read files in a folder of shots.
 
     Raises:
         PolarguideError: the suffix is wrong, a file exists, or ``out`` is in a folder of shots.
@@ -393,7 +410,7 @@ def _require_new(out: Path, shots: Path, settings: CalibrateSettings) -> None:
 
 
 def _say_shots(fit: ShotFit, settings: CalibrateSettings, measured: ShotMeans, reporter: Reporter) -> None:
-    """Report the estimates from the shots, and the assumptions on quantities that the shots do not determine."""
+    """Print the values that were estimated from the shots, and the assumptions that were needed."""
     angles = ", ".join(f"{angle:.1f}" for angle in np.degrees(fit.angles))
     reporter.say(
         f"{len(fit.angles)} shots, polarizer at {angles} degrees; misfit {fit.misfit:.2%} of their mean."

@@ -1,4 +1,4 @@
-"""Report of a calibration: figures of the positions, a table for the console, and a picture."""
+"""Report of a calibration: properties of the polarizers as a table for the console, and a picture."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from polarguide.visualization.figures import FONT, INK, Picture, contact_sheet, 
 from polarguide_shots.calibration.shots import ShotFit
 
 COUNTLESS = 1000.0
-"""Largest extinction ratio that can be measured, limited by noise and the polarizer."""
+"""Largest extinction ratio that can be measured. Noise and the polarizer limit it."""
 _COLORS = ("R", "G", "B")
 
 Array = NDArray[np.float64]
@@ -26,15 +26,15 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Position:
-    """Analyzers of one angle and color.
+    """Properties of the analyzers of one angle and color.
 
     Attributes:
-        name: "0", "45", ... or "R 0", ...
+        name: name such as "0" and "45", or "R 0" for a color sensor.
         angle: nominal angle, degrees.
-        color: 0 to 2, or None for a monochrome sensor.
-        throughput: throughput by block, [rows, columns]; the local mean is 1.
-        extinction: extinction ratio by block.
-        angle_error: error of the angle by block, degrees.
+        color: 0 to 2 for red, green and blue, or None for a monochrome sensor.
+        throughput: throughput of each block, [rows, columns]. The local mean is 1.
+        extinction: extinction ratio of each block.
+        angle_error: error of the angle of each block, degrees.
     """
 
     name: str
@@ -46,7 +46,7 @@ class Position:
 
 
 def positions(calibration: AnalyzerCalibration) -> list[Position]:
-    """Return the positions of a sensor, by color, then by angle."""
+    """Return the properties of the analyzers of a sensor, sorted by color, then by angle."""
     pattern = calibration.pattern
     colors = (None,) if pattern.colors is None else (0, 1, 2)
     rows = []
@@ -64,9 +64,9 @@ def positions(calibration: AnalyzerCalibration) -> list[Position]:
 
 
 def effect(calibration: AnalyzerCalibration) -> tuple[float, float]:
-    """Return the DoLP of unpolarized and of fully polarized light that the sensor measures without correction.
+    """Return the DoLP that the sensor measures without correction, for unpolarized and for fully polarized light.
 
-    Both are medians over the blocks. The latter is also the median over angles of the light.
+    Both values are medians over the blocks. The second value is also a median over the angles of the light.
     """
     pattern = calibration.pattern
     vectors = calibration.vectors.astype(np.float64)
@@ -88,7 +88,7 @@ def _polarized_light(angles: Array) -> Array:
 
 
 def lines(calibration: AnalyzerCalibration, analyzers: list[Position]) -> list[str]:
-    """Return the lines of the table for the console."""
+    """Return the lines of the table that is printed on the console."""
     rows = ["position   throughput             extinction ratio       angle error in degrees"]
     for position in analyzers:
         cells = []
@@ -112,7 +112,7 @@ def _ratio(value: float) -> str:
 
 
 _FORMS = {"throughput": "{:.3f}".format, "extinction": _ratio, "angle_error": "{:+.2f}".format}
-"""Formats of the figures of a position."""
+"""Functions that format the properties of a position for the table."""
 
 
 _CURVES = {0: (204, 51, 51), 45: (46, 134, 46), 90: (51, 102, 204), 135: (190, 120, 20)}
@@ -132,12 +132,12 @@ def calibration_picture(
     means: Array,
     pattern: Pattern,
 ) -> Picture:
-    """Draw a calibration.
+    """Draw the properties of the analyzers, and the intensities of the shots with their fit.
 
     Args:
         calibration: the calibration.
-        analyzers: its positions.
-        fit: angles and levels of the shots.
+        analyzers: properties of the analyzers.
+        fit: angles and brightness of the shots.
         means: means of the shots by position, [T, K].
         pattern: pattern of the region of the shots.
     """
@@ -149,7 +149,10 @@ def calibration_picture(
 
 
 def _maps(analyzers: Sequence[Position]) -> Picture:
-    """Draw throughput, extinction ratio and angle error by block: a row per angle, three columns per color."""
+    """Draw throughput, extinction ratio and angle error of each block.
+
+    The picture has a row for each angle, and three columns for each color.
+    """
     colors = list(dict.fromkeys(position.color for position in analyzers))
     kinds = (
         ("throughput", "throughput", "viridis"),
@@ -177,7 +180,7 @@ def _maps(analyzers: Sequence[Position]) -> Picture:
 
 
 def _range(values: Array, *, signed: bool) -> tuple[float, float]:
-    """Return the ends of a scale, rounded outward to two digits."""
+    """Return the lowest and highest value of a color scale, rounded outward to two digits."""
     low, high = (float(end) for end in np.percentile(values, [1, 99]))
     if signed:
         end = max(0.1, float(np.ceil(10 * max(abs(low), abs(high))) / 10))
@@ -195,7 +198,7 @@ def _curves(
     means: Array,
     pattern: Pattern,
 ) -> Picture:
-    """Draw the mean intensity of each angle of the pattern over the angle of the polarizer, with the fit."""
+    """Draw the mean intensity behind each analyzer as a function of the polarizer's angle, with the fit."""
     drawn: Picture = np.full((_HEIGHT, _WIDTH, 3), 255, np.uint8)
     places = pattern.angles.ravel()
     bottom = _HEIGHT - _BOTTOM
@@ -241,7 +244,7 @@ def _curves(
 
 
 def _legend(drawn: Picture, analyzers: Sequence[Position], x: int) -> None:
-    """Draw the medians of the positions."""
+    """Draw a legend with the median properties of the analyzers."""
     columns = (90, 168, 242)
     for text, place in zip(_FORMS, columns, strict=True):
         _text(drawn, text.replace("_", " "), x + place - 4, 50, 0.4)

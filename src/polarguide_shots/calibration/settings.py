@@ -24,7 +24,7 @@ from polarguide.core.records import check_options
 from polarguide.core.text import decimals
 
 NAMES = "names"
-"""Value of ``angles`` for angles in the names of files."""
+"""Value of the setting ``angles`` if the names of the files contain the angles."""
 _NUMBER = re.compile(r"(?:^|.*[_ ])(\d+(?:\.\d+)?)(?:deg)?")
 _SIGNED = re.compile(r".*[-+\u2212]\d+(?:\.\d+)?(?:deg)?")
 _IN_DEGREES = re.compile(r"\d ?deg(?![a-z])")
@@ -78,7 +78,7 @@ class CalibrateSettings(MosaicOptions):
             "--lens",
             expected="one line of text",
             found=repr(self.lens),
-            remedy="Leave control characters out.",
+            remedy="Remove control characters.",
         )
         period = sensor_pattern(self.sensor).period
         require(
@@ -91,9 +91,9 @@ class CalibrateSettings(MosaicOptions):
         require(
             self.reference != "angles" or self.angles is not None,
             "--reference",
-            expected="mean for unknown angles of the polarizer",
+            expected="mean, because the angles of the polarizer are unknown",
             found="angles",
-            remedy="Give the --angles, or leave it out.",
+            remedy="Specify --angles, or remove --reference.",
         )
         return self
 
@@ -103,10 +103,13 @@ class CalibrateSettings(MosaicOptions):
         return self.offset_x, self.offset_y
 
     def known_angles(self, files: Sequence[Path]) -> list[float] | None:
-        """Return the angle of the polarizer in each file in radians, counter-clockwise as displayed, or None.
+        """Return the angle of the polarizer in each file, or None if the angles are to be estimated.
+
+        Angles are in radians, counter-clockwise as displayed.
 
         Raises:
-            PolarguideError: the angles are not numbers, too few or too many, or a name does not end in an angle.
+            PolarguideError: an angle is not a number, there are too few or too many, or a name does not end in an
+                angle.
         """
         if self.angles is None:
             return None
@@ -126,7 +129,7 @@ class CalibrateSettings(MosaicOptions):
                 "--angles",
                 expected=f"an angle for each of the {len(files)} shots",
                 found=f"{len(degrees)} angles",
-                remedy="List them in the order of the files' names; keep dark frame and flat field elsewhere.",
+                remedy="List the angles in the order of the files' names. Keep dark frame and flat field elsewhere.",
             )
         sign = -1.0 if self.sense == "cw" else 1.0
         return [sign * math.radians(angle) for angle in degrees]
@@ -136,7 +139,7 @@ def _angle_of(path: Path) -> float:
     """Return the angle in degrees at the end of a file name.
 
     Raises:
-        PolarguideError: the name does not end in an angle, or in several.
+        PolarguideError: the name does not end in exactly one angle.
     """
     number = _NUMBER.fullmatch(path.stem)
     reason = ""

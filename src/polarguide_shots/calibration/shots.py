@@ -1,16 +1,17 @@
-"""Shots of a polarizer in front of a uniform light: validation, means over the sensor, angles and levels.
+"""Analyze shots of a polarizer in front of a uniform light: validate them, and estimate their angles and brightness.
 
 The means of all positions of the pattern form a matrix ``M = X A^T``. X [T, 3] contains the Stokes vectors of the
-shots, ``L (1, e cos 2t, e sin 2t)``, and A [K, 3] the analyzer vectors of the positions. Both are estimated jointly by
-least squares. A is linear for given X and is eliminated (variable projection, Golub and Pereyra 1973).
+shots, ``L (1, e cos 2t, e sin 2t)``, with level L and angle t of each shot. A [K, 3] contains the analyzer vectors of
+the positions. Both are estimated jointly by least squares. A is linear for given X and is eliminated (variable
+projection, Golub and Pereyra 1973).
 
 M does not determine:
 
-- the scale of A against L
-- for unknown angles, their common zero and their sense, which follow from the names of the positions
+- the scale of A relative to L
+- for unknown angles, their common zero and their direction, which follow from the nominal angles of the positions
 - the diattenuation e of the polarizer, which scales S1 and S2
-- for unknown angles and levels, two more numbers. X may undergo a Lorentz boost, as by another polarizer in front or by
-  a polarized lamp.
+- for unknown angles and levels, two more numbers. They correspond to a Lorentz boost of X, as a second polarizer in
+  front or a polarized lamp would cause.
 
 Levels are therefore free if the angles or an unpolarized flat field are given. Otherwise the light must be steady and
 unpolarized, and all levels are equal.
@@ -47,15 +48,15 @@ from polarguide.geometry.polarizer import malus
 from polarguide_shots.calibration.settings import CalibrateSettings
 
 FEWEST = 5
-"""Smallest number of angles, the number of points that determine an ellipse."""
+"""Smallest number of angles in the shots. Five points determine an ellipse."""
 SATURATED = 0.001
-"""Largest share of saturated samples of a shot, which allows for a few defects of the sensor."""
+"""Largest share of saturated samples in a shot. It allows for a few defects of the sensor."""
 TOO_DARK = 0.02
-"""Smallest mean of a shot, as a share of full scale."""
+"""Smallest mean of a shot that is bright enough, as a share of full scale."""
 UNEVEN = 0.2
-"""Smallest brightness of the dimmest part of a uniform light, as a share of the brightest part."""
+"""Smallest ratio of the dimmest to the brightest part of a uniform light."""
 TEXTURED = 0.05
-"""Largest relative deviation of uniform light within 32 pixels."""
+"""Largest relative deviation of a uniform light within 32 pixels."""
 _CELLS = 16
 _SMALLEST = 64
 
@@ -64,13 +65,13 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class ShotMeans:
-    """Levels and means of all shots.
+    """Mean intensities of all shots.
 
     Attributes:
-        levels: levels of the stored values.
-        means: means of each shot over the sensor, [T, P * P], by position in the pattern of the region, row by row;
-            full scale is 1.
-        flat: means of the flat field, [P * P], or None.
+        levels: black level and full scale of the stored values.
+        means: [T, P * P] means of each shot over the sensor, for each position in the pattern of the region, row by
+            row. Full scale is 1.
+        flat: [P * P] means of the flat field, or None.
     """
 
     levels: Levels
@@ -79,15 +80,15 @@ class ShotMeans:
 
 
 class Shots:
-    """The files of a calibration.
+    """Files of a calibration, and their mean intensities.
 
     Args:
         root: folder of the shots.
         settings: settings of the calibration.
 
     Attributes:
-        files: shots of the polarizer, by name.
-        pattern: pattern of the region, from its top-left pixel.
+        files: shots of the polarizer, sorted by name.
+        pattern: pattern of the region. It starts at its top-left pixel.
 
     Raises:
         PolarguideError: there are too few shots.
@@ -119,15 +120,16 @@ class Shots:
 
     @property
     def size(self) -> tuple[int, int]:
-        """Width and height of the mosaics, after the first reading."""
+        """Width and height of the mosaics. It is known after the first file was read."""
         assert self._first is not None
         return self._first[1][1], self._first[1][0]
 
     def measure(self, reporter: Reporter) -> ShotMeans:
-        """Read all files, and compute their levels and means.
+        """Read all files, and compute their mean intensities.
 
         Raises:
-            PolarguideError: a file is damaged, of another size, saturated, dark, or not of a uniform light.
+            PolarguideError: a file is damaged, has a different size, is saturated or dark, or does not show a uniform
+                light.
         """
         files = [*self.files, *self._flat]
         period = self.pattern.period
@@ -189,7 +191,11 @@ class Shots:
     def linear(
         self, levels: Levels, reporter: Reporter
     ) -> Iterator[tuple[NDArray[np.float32], NDArray[np.bool_]]]:
-        """Read each shot again: linear intensities [H, W] with full scale 1, and a mask [H, W] of saturated samples."""
+        """Read the shots again, one after the other.
+
+        Yields:
+            Linear intensities [H, W] with full scale 1; and a mask [H, W] of saturated samples.
+        """
         with reporter.track("fitting pixels", len(self.files)) as advance:
             for number, path in enumerate(self.files, 1):
                 values = self._read(path)
@@ -212,7 +218,12 @@ class Shots:
         return values
 
     def _levels(self, counts: list[NDArray[np.int64]], stated: int | None) -> Levels:
-        """Estimate the levels from counts of stored values, and the full scale that files state."""
+        """Estimate black level and full scale of the stored values.
+
+        Args:
+            counts: for each shot, the number of samples with each stored value.
+            stated: full scale that the files state, or None.
+        """
         used = np.concatenate([np.flatnonzero(count) for count in counts])
         assert self._first is not None
         path, _, kind = self._first
@@ -227,7 +238,7 @@ class Shots:
         )
 
     def _require_uniform(self, light: NDArray[np.float32]) -> None:
-        """Check that the light is uniform: without texture, and without dark parts.
+        """Check that the light is uniform. It must have no texture and no dark parts.
 
         Raises:
             PolarguideError: the light is not uniform.
@@ -264,7 +275,7 @@ class Shots:
 
 
 def _files(option: str, path: Path | None) -> list[Path]:
-    """Return a file, or the files of a folder.
+    """Return the files that an option specifies: a single file, or all mosaics of a folder.
 
     Raises:
         PolarguideError: the folder has no mosaic.
@@ -277,40 +288,43 @@ def _files(option: str, path: Path | None) -> list[Path]:
         f"{option} {path}",
         expected="a mosaic, or a folder of mosaics",
         found=describe_contents(path),
-        remedy="Leave it out, or give the files.",
+        remedy="Remove the option, or specify the files.",
     )
     return paths
 
 
 MISFIT = 0.02
-"""Relative deviation of the means from the fit above which the shots contradict each other."""
+"""Largest relative deviation of the means from the fit. Above it, the shots contradict each other."""
 SAME_ANGLE = np.radians(2.0)
-"""Largest difference of equal angles, radians."""
+"""Largest difference of two angles that count as equal, radians."""
 NARROW = 0.15
-"""Smallest singular value of the directions of the shots; angles all around have 0.7."""
+"""Smallest spread of the angles, as a singular value of the directions of the shots.
+
+Angles that are spread over half a turn have 0.7.
+"""
 POLARIZED = 0.5
-"""Smallest DoLP of a shot through a polarizer."""
+"""Smallest DoLP of a shot that was taken through a polarizer."""
 FLAT_POLARIZED = 0.1
-"""DoLP from which a flat field is certainly polarized. Gains of a sensor are smaller."""
+"""Smallest DoLP of a flat field that is certainly polarized. Unequal gains of a sensor cause less."""
 UNSTEADY = 0.15
-"""Largest change of the brightness by errors of a sensor (3 % of gain, extinction ratios of 20)."""
+"""Largest change of the brightness that sensor errors can cause (3 % of gain, extinction ratios of 20)."""
 LARGEST_ZERO = np.radians(10.0)
-"""Largest error of the zero of given angles, radians."""
+"""Largest error of the zero direction of angles that the user specified, radians."""
 ALIKE = 0.9
-"""Smallest agreement of matching lists of angles; lists with a constant difference have 1."""
+"""Smallest agreement between specified and estimated angles. It is 1 if they differ by a constant."""
 
 
 @dataclass(frozen=True, eq=False)
 class ShotFit:
-    """Estimated angles and levels of the shots.
+    """Estimated angles and brightness of the shots.
 
     Attributes:
         angles: angles of the polarizer, radians, [T].
-        levels: levels of the light behind the polarizer, [T], with mean 1.
+        levels: brightness of the light behind the polarizer, [T], with mean 1.
         vectors: analyzer vectors of the positions, [K, 3], in the unit of the means.
         misfit: root mean square deviation of the means from the fit, as a share of their mean.
-        zero: mean deviation of the positions from their nominal angles before the choice of the zero, radians.
-        flat_dolp: DoLP of the flat field with the calibration, or None.
+        zero: mean deviation of the positions from their nominal angles in radians, before the zero direction is chosen.
+        flat_dolp: DoLP of the flat field according to the calibration, or None.
     """
 
     angles: Array
@@ -321,7 +335,7 @@ class ShotFit:
     flat_dolp: float | None
 
     def stokes(self, diattenuation: float) -> Array:
-        """Return the Stokes vectors of the light in the shots, [T, 3]."""
+        """Return the Stokes vectors [T, 3] of the light in the shots, behind a polarizer with this diattenuation."""
         return _stokes(self.angles, self.levels, diattenuation)
 
 
@@ -335,15 +349,16 @@ def solve_shots(
     to_mean: bool,
     files: Sequence[Path],
 ) -> ShotFit:
-    """Estimate the angles and levels of the shots.
+    """Estimate the angles and the brightness of the shots.
 
     Args:
         means: means of each shot by position, [T, K].
-        nominal: angles of the positions by their names, radians, [K].
-        known: angles of the polarizer, radians, [T]; None to estimate them.
+        nominal: nominal angles of the positions, radians, [K].
+        known: angles of the polarizer, radians, [T]. If None, they are estimated.
         flat: means of the flat field, [K], or None.
         diattenuation: diattenuation of the polarizer, (E - 1) / (E + 1) for the extinction ratio E.
-        to_mean: choose the zero of the angles at which the positions have no mean deviation from their names.
+        to_mean: True to choose the zero direction so that the positions have no mean deviation from their nominal
+            angles.
         files: files of the shots, for messages.
 
     Raises:
@@ -358,7 +373,7 @@ def solve_shots(
             path,
             expected=f"light through a polarizer, with a DoLP above {POLARIZED:.0%}",
             found=f"{_dolp(stokes):.0%}",
-            remedy="Take it through the polarizer, and the --flat without it. Check --sensor and offsets.",
+            remedy="Take the shot through the polarizer, and --flat without the polarizer. Check --sensor and offsets.",
         )
     if flat is not None:
         dolp = _dolp(_pixel_stokes(flat[None], nominal)[0])
@@ -367,7 +382,7 @@ def solve_shots(
             "--flat",
             expected="unpolarized light",
             found=f"a DoLP of {dolp:.0%}",
-            remedy="Take it without the polarizer, of a light behind a thick diffuser; no screen, no reflection.",
+            remedy="Take --flat without the polarizer, with a thick diffuser. Avoid screens and reflections.",
         )
     apparent = np.arctan2(start[:, 2], start[:, 1]) / 2
     if known is not None:
@@ -416,20 +431,20 @@ def _require_steady(brightness: Array, folder: Path) -> None:
     require(
         change <= UNSTEADY,
         folder,
-        expected=f"one steady, unpolarized light, whose shots differ by at most {UNSTEADY:.0%} in brightness",
+        expected=f"one steady, unpolarized light: shots that differ in brightness by at most {UNSTEADY:.0%}",
         found=f"{change:.0%}: the lamp is polarized, or lamp or exposure changed",
-        remedy="Give --angles, or --flat (a picture without the polarizer), which measure the light of each shot.",
+        remedy="Specify --angles, or --flat (a picture without the polarizer), to measure the light of each shot.",
     )
 
 
 def _stokes(angles: Array, levels: Array, diattenuation: float) -> Array:
-    """Return Stokes vectors behind a polarizer, [T, 3]."""
+    """Return the Stokes vectors [T, 3] of light behind a polarizer, given its angles and the levels of the light."""
     polarized = diattenuation * np.cos(2 * angles), diattenuation * np.sin(2 * angles)
     return levels[:, None] * np.stack([np.ones_like(angles), *polarized], axis=1)
 
 
 def _pixel_stokes(means: Array, nominal: Array) -> Array:
-    """Return the Stokes vectors that ideal analyzers would measure, [T, 3], with equal levels of all colors."""
+    """Return the Stokes vectors [T, 3] that ideal analyzers would measure. All colors are scaled to the same level."""
     ideal = np.stack([malus(unit, nominal) for unit in np.eye(3)], axis=1)
     balanced = means
     if len(nominal) > 4:  # cells behind color filters
@@ -448,15 +463,20 @@ def _refined(
     flat: Array | None,
     diattenuation: float,
 ) -> tuple[Array, Array]:
-    """Fit angles and levels by variable projection. The first level and the known angles, or the first, are fixed.
+    """Fit angles and levels by variable projection.
+
+    The first level is fixed. Known angles are fixed; otherwise, only the first angle is fixed.
 
     Args:
         means: means of each shot by position, [T, K].
-        apparent, brightness: initial angles and levels, [T].
-        known, flat, diattenuation: as for ``solve_shots``.
+        apparent: initial angles, [T].
+        brightness: initial levels, [T].
+        known: known angles, as for ``solve_shots``.
+        flat: means of the flat field, as for ``solve_shots``.
+        diattenuation: diattenuation of the polarizer, as for ``solve_shots``.
 
     Returns:
-        Angles and levels, [T].
+        Angles and levels, each [T].
     """
     count = len(means)
     initial = apparent if known is None else np.asarray(known)
@@ -497,7 +517,7 @@ def _refined(
 
 
 def _require_different(angles: Array, folder: Path, known: bool) -> None:
-    """Check the number and the spread of the angles.
+    """Check that there are enough angles, and that they are spread widely enough.
 
     Raises:
         PolarguideError: the angles are too few or too similar.
@@ -520,10 +540,11 @@ def _require_different(angles: Array, folder: Path, known: bool) -> None:
 
 
 def _require_match(known: Array, apparent: Array, folder: Path, to_mean: bool) -> None:
-    """Check that given angles match the apparent angles.
+    """Check that specified angles match the estimated angles.
 
     Raises:
-        PolarguideError: the given angles have the other sense or another zero, or belong to other shots.
+        PolarguideError: the specified angles increase in the opposite direction, start at a different zero, or belong
+            to different shots.
     """
     along, against = (np.mean(np.exp(2j * (apparent - sign * known))) for sign in (1, -1))
     other_sense = abs(against) >= ALIKE
@@ -547,13 +568,13 @@ def _require_match(known: Array, apparent: Array, folder: Path, to_mean: bool) -
 
 
 def _mean_deviation(vectors: Array, nominal: Array) -> float:
-    """Return the circular mean of the deviations of the positions' angles from their names, in radians."""
+    """Return the circular mean of the positions' deviations from their nominal angles, in radians."""
     angles = np.arctan2(vectors[:, 2], vectors[:, 1]) / 2
     return float(np.angle(np.mean(np.exp(2j * (angles - nominal))))) / 2
 
 
 def _turned(vectors: Array, angle: float) -> Array:
-    """Rotate analyzer vectors [K, 3] by an angle in radians."""
+    """Rotate analyzer vectors [K, 3] about the optical axis, by an angle in radians."""
     cosine = np.cos(2 * angle)
     sine = np.sin(2 * angle)
     s0, s1, s2 = vectors.T

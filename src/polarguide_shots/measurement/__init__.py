@@ -1,1 +1,1 @@
-"""Measurement of shots: figures of regions, limits, and a golden part, for inspection lines."""
+"""Measure regions of shots for inspection lines, and compare them with limits and with a reference part."""

@@ -1,4 +1,4 @@
-"""Measurement of shots: figures of regions, limits and a reference, with or without a table."""
+"""Measure regions of shots, and compare them with limits and a reference. The results may be written to a table."""
 
 from __future__ import annotations
 
@@ -66,12 +66,12 @@ from polarguide_shots.sets import ExposureSet
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class MeasuredShot:
-    """A measured shot.
+    """Measurements of one shot.
 
     Attributes:
         maps: maps of the shot.
-        differences: differences to the reference, or None.
-        regions: figures of the regions by ``Field.key``, from ``region`` on.
+        differences: differences from the reference, or None.
+        regions: measured values of each region by ``Field.key``. The first key is ``region``.
         status: worst status of the regions.
         beyond: all regions with their exceeded limits; empty if all regions are within their limits.
     """
@@ -83,12 +83,12 @@ class MeasuredShot:
     beyond: Sequence[tuple[Region, Sequence[str]]]
 
     def entry(self, files: tuple[FileStamp, ...] = (), picture: str = "") -> Entry:
-        """Return the line of the table."""
+        """Return the line of the table for this shot."""
         return Entry(FORMAT, self.maps.name, files, self.status, "", self.maps.notes, self.regions, picture)
 
 
 class Measurer:
-    """Regions, limits and reference of many shots.
+    """Measures many shots in the same regions, with the same limits and reference.
 
     Args:
         options: quantities to measure, and their limits.
@@ -115,11 +115,14 @@ class Measurer:
 
     @property
     def reference_files(self) -> tuple[Path, ...]:
-        """Files of the reference, which are not measured in a watched folder."""
+        """Files of the reference, which are skipped in a watched folder."""
         return () if self.reference is None else self.reference.files
 
     def read(self, shot: ExposureSet, *, whole: bool = False) -> ShotMaps:
-        """Read the maps of a shot: of the regions at least, or of the whole picture if requested or with a reference.
+        """Read the maps of a shot.
+
+        The maps contain at least all regions. They contain the whole picture if ``whole`` is True or if there is a
+        reference.
 
         Raises:
             PolarguideError, OSError, MemoryError: the shot cannot be read.
@@ -127,7 +130,7 @@ class Measurer:
         return read_shot(shot, self._reading, part=None if whole else self._part)
 
     def measured(self, shot: ExposureSet, maps: ShotMaps) -> MeasuredShot:
-        """Compute the figures of the maps of a shot.
+        """Compute the measured values of a shot from its maps.
 
         Raises:
             PolarguideError: the shot does not fit the regions or the reference.
@@ -156,14 +159,14 @@ class Measurer:
         return MeasuredShot(maps, differences, tuple(figures), status, beyond if status == "beyond" else [])
 
     def entry(self, shot: ExposureSet) -> Entry:
-        """Return the line of a shot, or of an error."""
+        """Return the line of a shot. If the shot cannot be read, the line contains the error."""
         try:
             return self.measured(shot, self.read(shot)).entry()
         except UNREADABLE as error:
             return unread_entry(shot, (), error)
 
     def judge(self, entry: Entry) -> Entry:
-        """Compare a line of a table with the limits. Its figures do not change."""
+        """Compare the values in a line of the table with the limits, and update its status."""
         regions = []
         for figures in entry.regions:
             bounds = self.limits.of(str(figures["region"]))
@@ -173,7 +176,7 @@ class Measurer:
         )
 
     def settings(self) -> dict[str, Any]:
-        """Return the settings that the figures depend on, as JSON data."""
+        """Return the settings that influence the measured values, as JSON data."""
         reading = {f.name: getattr(self._reading, f.name) for f in dataclasses.fields(self._reading)}
         settings = {
             "reading": reading,
@@ -195,35 +198,35 @@ def unread_entry(shot: ExposureSet, files: tuple[FileStamp, ...], error: BaseExc
     Args:
         shot: the shot.
         files: ``stamps`` of its files.
-        error: one of ``UNREADABLE``.
+        error: exception of a type in ``UNREADABLE``.
     """
     return Entry(FORMAT, shot.name, files, "unread", str(fault_of(shot, error)), (), ())
 
 
 BEYOND = "beyond"
-"""Folder of pictures of shots beyond their limits."""
+"""Name of the folder for pictures of shots that exceed a limit."""
 DIFFERENCES = "differences"
-"""Folder of pictures of differences."""
+"""Name of the folder for pictures of the differences from the reference."""
 Heard = Callable[[Entry], None]
-"""Callback for the line of each shot."""
+"""Callback that receives the line of each measured shot."""
 
 
 def ignore(entry: Entry) -> None:
-    """Ignore the line of a shot, as the default callback."""
+    """Do nothing with the line of a shot. This is the default callback."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Outcome:
-    """Result of a command.
+    """Result of measuring shots, or of watching a folder.
 
     Attributes:
-        folder: folder of the table; None without a table.
-        counts: numbers of shots by status: all shots of ``measure_shots``, including shots that were in the table
-            before; new shots of ``watch_folder``.
-        earlier: number of shots that were in the table before; 0 for ``watch_folder``.
+        folder: folder of the table. None without a table.
+        counts: numbers of shots by status. For ``measure_shots``, they include shots that were in the table before. For
+            ``watch_folder``, only new shots count.
+        earlier: number of shots that were in the table before. Always 0 for ``watch_folder``.
         waiting: names of incomplete shots of a watched folder.
-        trouble: reason why no shot was found in a watched folder that is not empty; else empty.
-        entries: lines of the shots without a table.
+        trouble: reason why no shot was found in a watched folder that is not empty. Otherwise an empty string.
+        entries: lines of the shots if there is no table.
     """
 
     folder: Path | None
@@ -235,23 +238,23 @@ class Outcome:
 
     @property
     def rows(self) -> list[dict[str, Value]]:
-        """Records of all regions of ``entries``, with the fields of the table, for ``pandas.DataFrame``."""
+        """Measured values of all regions in ``entries``, one dictionary per region, for ``pandas.DataFrame``."""
         return [dict(zip(KEYS, row, strict=True)) for entry in self.entries for row in entry.rows()]
 
     @property
     def exit_status(self) -> int:
-        """3 if a shot is beyond a limit, else 2 if a shot was not read, else 0."""
+        """Exit status of the command: 3 if a shot exceeds a limit, else 2 if a shot was not read, else 0."""
         if self.counts["beyond"]:
             return 3
         return 2 if self.counts["unread"] or self.waiting or self.trouble else 0
 
 
 class ChangedWhileRead(PolarguideError):
-    """The error of a file that was written to while it was read."""
+    """Error for a file that changed while it was read."""
 
 
 class Line(contextlib.AbstractContextManager["Line"]):
-    """A ``Measurer`` with an open table. The context manager closes the table.
+    """A ``Measurer`` that writes its results to a table. The context manager closes the table.
 
     Args:
         out: folder of the table.
@@ -274,7 +277,7 @@ class Line(contextlib.AbstractContextManager["Line"]):
         self.table.close()
 
     def measure(self, shot: ExposureSet, files: tuple[FileStamp, ...]) -> Entry:
-        """Measure a shot, draw its pictures, and write its line.
+        """Measure a shot, draw its pictures, and write its line to the table.
 
         Args:
             shot: the shot.
@@ -282,7 +285,8 @@ class Line(contextlib.AbstractContextManager["Line"]):
 
         Raises:
             ChangedWhileRead: a file has changed. Nothing was written.
-            PolarguideError, OSError, MemoryError: the shot cannot be read, or does not fit regions or reference.
+            PolarguideError, OSError, MemoryError: the shot cannot be read, or does not fit the regions or the
+                reference.
         """
         maps = self.measurer.read(shot)
         if stamps(shot.paths) != files:
@@ -290,18 +294,18 @@ class Line(contextlib.AbstractContextManager["Line"]):
                 shot.where,
                 expected="a file that does not change while it is read",
                 found="a file that was written to",
-                remedy="Repeat the command when it is complete; --watch waits for that.",
+                remedy="Repeat the command when the file is complete, or use --watch, which waits for complete files.",
             )
         measured = self.measurer.measured(shot, maps)
         # A line in the table implies that its pictures exist.
         return self.table.add(measured.entry(files, self._draw(shot, measured)))
 
     def unread(self, shot: ExposureSet, files: tuple[FileStamp, ...], error: BaseException) -> Entry:
-        """Write the line of a shot that cannot be measured."""
+        """Write the line of a shot that cannot be measured, and return it."""
         return self.table.add(unread_entry(shot, files, error))
 
     def _draw(self, shot: ExposureSet, measured: MeasuredShot) -> str:
-        """Write the pictures of a shot, and return their name; empty without pictures."""
+        """Write the pictures of a shot, and return the name of the files, which is empty without pictures."""
         reference = self.measurer.reference
         if not measured.beyond and reference is None:
             return ""
@@ -321,7 +325,7 @@ class Line(contextlib.AbstractContextManager["Line"]):
         write_png(self.out / BEYOND / f"{name}.png", picture)
 
     def follow_judgment(self, shot: ExposureSet, entry: Entry) -> None:
-        """Draw or remove the picture of a shot after a change of the limits.
+        """Draw or remove the picture of a shot whose status was updated because the limits changed.
 
         Raises:
             PolarguideError, OSError, MemoryError: the shot cannot be read, or the picture cannot be written.
@@ -333,7 +337,7 @@ class Line(contextlib.AbstractContextManager["Line"]):
 
 
 Source = PathLike | ExposureSet | Array | Sequence[Array]
-"""A file or folder, a result of ``find_shots``, or the array of one shot (see ``read_shot``)."""
+"""Input of ``measure_shots``: a file, a folder, a result of ``find_shots``, or the array of one shot."""
 
 
 def measure_shots(
@@ -346,20 +350,21 @@ def measure_shots(
     heard: Heard = ignore,
     reporter: Reporter = SILENT,
 ) -> Outcome:
-    """Measure shots, with or without a table. Shots that are in the table are not measured again.
+    """Measure shots, and optionally write the results to a table. Shots that are in the table are skipped.
 
     Args:
-        paths: files and folders (see ``find_shots``), or one array for each shot (see ``read_shot``). Arrays have the
-            names of a mapping, or array-1, array-2, ... An iterator of arrays is consumed one by one.
-        out: folder of ``table.csv``, ``table.jsonl`` and pictures; None: no table.
+        paths: files and folders (see ``find_shots``), or one array for each shot (see ``read_shot``). Arrays in a
+            mapping are named by its keys, other arrays array-1, array-2, ... An iterator of arrays is consumed one by
+            one.
+        out: folder of ``table.csv``, ``table.jsonl`` and pictures. If None, no table is written.
         options: quantities to measure, and their limits.
         reading: options of reading.
         angles: angles of arrays with pictures through a filter.
-        heard: callback for each shot, after its line is on disk, or without a table after its measurement.
+        heard: callback for each shot. It is called after the line is on disk, or without a table after the measurement.
         reporter: receiver of progress and messages.
 
     Returns:
-        The result. Without a table, it has the lines as ``entries`` and ``rows``.
+        The result. Without a table, its attributes ``entries`` and ``rows`` contain the measured values.
 
     Example:
         >>> regions = polarguide.MeasureOptions(roi=("pin=120,80,40,40",))              # doctest: +SKIP
@@ -369,7 +374,7 @@ def measure_shots(
 
     Raises:
         PolarguideError: there is no shot, an option is invalid, an array is not a shot, or the table cannot be written.
-            A shot that cannot be read does not raise an error. Its line has the reason.
+            A shot that cannot be read does not raise an error; its line contains the reason.
     """
     shots, total = _shots_of(paths, out, reading, angles)
     counts: Counter[str] = Counter()
@@ -399,14 +404,18 @@ def measure_shots(
 
 
 def _measure_into(line: Line, shot: ExposureSet, heard: Heard) -> tuple[bool, Entry]:
-    """Measure a shot unless it is in the table. Return True if it was in the table, and the line."""
+    """Measure a shot unless it is in the table already.
+
+    Returns:
+        True if the shot was in the table; and its line.
+    """
     files: tuple[FileStamp, ...] = ()
     with contextlib.suppress(OSError):
         files = stamps(shot.paths)
     known = line.table.entry_of(files) if files else None
     if known is not None:
         if line.table.judged_again:
-            with contextlib.suppress(*UNREADABLE):  # the line is more important than the picture
+            with contextlib.suppress(*UNREADABLE):  # a missing picture must not prevent the line
                 line.follow_judgment(shot, known)
             if known.status == "beyond":
                 heard(known)
@@ -425,7 +434,7 @@ def _shots_of(
     reading: ShotOptions,
     angles: Sequence[Angle],
 ) -> tuple[Iterable[ExposureSet], int | None]:
-    """Return the shots, and their number or None for an iterator.
+    """Return the shots to measure, and their number. An iterator has no number, which gives None.
 
     Raises:
         PolarguideError: there is no shot, or an array is not a shot.
@@ -438,7 +447,7 @@ def _shots_of(
         "paths",
         expected="several shots",
         found="one array",
-        remedy="Put it into a list: measure([array]).",
+        remedy="Put the array into a list: measure([array]).",
     )
     if not isinstance(paths, Sequence):
         return (_array_set(shot, number, reading, angles) for number, shot in enumerate(paths, 1)), None
@@ -459,7 +468,7 @@ def _shots_of(
 
 
 def _array_set(shot: Source, number: int, reading: ShotOptions, angles: Sequence[Angle]) -> ExposureSet:
-    """Return the exposure set of an array, or a set unchanged.
+    """Convert an array to an ``ExposureSet``. An ``ExposureSet`` is returned unchanged.
 
     Raises:
         PolarguideError: the array is not a shot.
@@ -472,6 +481,6 @@ def _array_set(shot: Source, number: int, reading: ShotOptions, angles: Sequence
             name,
             expected="an array",
             found=type(shot).__name__,
-            remedy="An iterator delivers arrays; give paths as a list.",
+            remedy="An iterator must yield arrays. Specify paths as a list.",
         )
     return array_shot(stacked_array(shot, name), reading, angles, name)

@@ -1,4 +1,4 @@
-"""Pictures of shots beyond their limits, and of differences to a golden part."""
+"""Draw shots that exceed a limit, and the differences from a reference part."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ from polarguide_shots.measurement.regions import Differences, Region
 from polarguide_shots.measurement.table import NO_LIMITS, Bound, Limits
 
 S0_RANGE = 0.2
-"""Difference of S0 with the full color, in full scales."""
+"""Difference of S0 that gets the most saturated color, as a share of full scale."""
 DOLP_RANGE = 0.1
-"""Difference of DoLP with the full color."""
+"""Difference of DoLP that gets the most saturated color."""
 AOLP_RANGE = 20.0
-"""Difference of AoLP with the full color, degrees."""
+"""Difference of AoLP that gets the most saturated color, in degrees."""
 _WIDEST = 1600
 _NARROWEST = 640
 _WITHIN = (64, 200, 64)
@@ -39,32 +39,32 @@ _DEFECT = (255, 224, 0)
 _NOT_COMPARED = 110
 _BAR = 256
 _CHARACTER = 9
-"""Width of a character of wrapped text in pixels; most texts are narrower."""
+"""Assumed width of a character in wrapped text, in pixels. Most texts are narrower."""
 Beyond = Sequence[tuple[Region, Sequence[str]]]
-"""Regions of a shot with their exceeded limits, in texts that begin with the field."""
+"""Type of a list of regions, each with texts on its exceeded limits. A text starts with the name of the field."""
 _LOST = {reason.name.lower(): reason for reason in Reason if reason != Reason.USABLE}
-"""Reasons by the names of the fields that count their pixels."""
+"""Reasons by the names of the table fields that count pixels with these reasons."""
 _OF_NO_PIXEL = ("_error", "_deviation", "_share", "_concentration")
-"""Ends of the names of fields whose limits do not apply to single pixels."""
+"""Endings of the names of fields whose limits apply to regions, not to single pixels."""
 _SPECKLE = 5
-"""Side of the median filter of outlines. Interpolation spreads the noise of a sample over three pixels."""
+"""Side of the median filter that removes speckle from outlines. Interpolation spreads noise over three pixels."""
 
 
 def regions_picture(
     maps: ShotMaps, regions: Beyond, limits: Limits = NO_LIMITS, differences: Differences | None = None
 ) -> Picture:
-    """Draw the photograph and the layers in which a shot exceeds its limits, with the exceeded limits below.
+    """Draw a shot that exceeds a limit: its photograph, the affected maps, and a text with the exceeded limits.
 
-    Regions beyond their limits are red. Pixels in them that exceed a limit are outlined.
+    Regions that exceed a limit are red. Pixels in them that exceed the limit are outlined.
 
     Args:
-        maps: the shot.
+        maps: maps of the shot.
         regions: regions of the shot with their exceeded limits.
         limits: limits of the regions.
-        differences: differences to the golden part, or None.
+        differences: differences from the reference part, or None.
 
     Returns:
-        uint8 RGB, 640 to 1600 pixels wide except for shots of extreme sizes.
+        uint8 RGB. The picture is 640 to 1600 pixels wide, except for shots of extreme sizes.
     """
     layers = _layers(maps, differences)
     exceeded = [(region, text.partition(" ")[0]) for region, beyond in regions for text in beyond]
@@ -84,11 +84,11 @@ def regions_picture(
 
 
 PHOTOGRAPH = "photograph"
-"""Name of the layer of the photograph, the last one."""
+"""Name of the panel with the photograph, which is the last one."""
 
 
 def _layer_of(field: str) -> str:
-    """Return the layer that shows a field."""
+    """Return the name of the panel that shows a field of the table."""
     key = field.partition("_")[0]
     if "_difference" in field:
         return f"{key}_difference"
@@ -96,7 +96,7 @@ def _layer_of(field: str) -> str:
 
 
 def _layers(maps: ShotMaps, differences: Differences | None) -> dict[str, tuple[str, Picture, Map]]:
-    """Return titles, pictures and values of the layers of a shot, in the units of the fields."""
+    """Return the panels of a shot by name: for each its title, its picture, and its values in the unit of the field."""
     dolp, aolp = (
         torch.from_numpy(np.ascontiguousarray(values)) for values in (maps.dolp_debiased, maps.aolp)
     )
@@ -124,7 +124,10 @@ def _layers(maps: ShotMaps, differences: Differences | None) -> dict[str, tuple[
 def _pixels_beyond(
     maps: ShotMaps, values: Map, region: Region, field: str, bound: Bound
 ) -> NDArray[np.bool_]:
-    """Return a mask [H, W] of the pixels of a region that exceed a limit; empty for limits that are not of pixels."""
+    """Return a mask [H, W] of the pixels of a region that exceed a limit.
+
+    The mask is empty if the limit applies to the region as a whole.
+    """
     beyond = np.zeros(maps.reason.shape, bool)
     low = -math.inf if bound.min is None else bound.min
     high = math.inf if bound.max is None else bound.max
@@ -143,7 +146,7 @@ def _pixels_beyond(
 
 
 def _outline(panel: Picture, mask: NDArray[np.bool_]) -> None:
-    """Draw the outline of pixels, without speckle."""
+    """Draw the outline of the pixels in a mask, without speckle."""
     smooth = cv2.medianBlur(mask.astype(np.uint8), _SPECKLE)
     large = cv2.resize(smooth, panel.shape[1::-1], interpolation=cv2.INTER_NEAREST)
     outlines, _ = cv2.findContours(large, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
@@ -153,7 +156,7 @@ def _outline(panel: Picture, mask: NDArray[np.bool_]) -> None:
 
 
 def _boxes(panel: Picture, scale: float, regions: Beyond) -> None:
-    """Draw regions and their names in red beyond their limits, in green within."""
+    """Draw regions with their names: red if they exceed a limit, else green."""
     thick = max(1, round(panel.shape[1] / 500))
     for region, beyond in sorted(regions, key=lambda pair: bool(pair[1])):
         color = _BEYOND if beyond else _WITHIN
@@ -180,7 +183,7 @@ def _strip(lines: Sequence[str], color: tuple[int, int, int], width: int) -> Pic
 
 
 def _enlarged(picture: Picture) -> tuple[Picture, float]:
-    """Return a copy of a picture at the width of a page, and its scale."""
+    """Return a copy of a picture that is scaled to the width of a page, and the scale factor."""
     width = picture.shape[1]
     scale = _WIDEST / width if width > _WIDEST else float(max(1, math.ceil(_NARROWEST / width)))
     way = cv2.INTER_AREA if scale < 1 else cv2.INTER_NEAREST
@@ -198,7 +201,10 @@ def _name(picture: Picture, name: str, x: int, y: int, color: tuple[int, int, in
 
 
 def difference_picture(differences: Differences, shot: str, reference: str) -> Picture:
-    """Draw the three differences in one row: red above the reference, blue below, gray if not compared."""
+    """Draw the differences of S0, DoLP and AoLP side by side.
+
+    A pixel is red if it exceeds the reference, blue if it is below the reference, and gray if it was not compared.
+    """
     panels = _difference_panels(differences).values()
     names = " - ".join(name if len(name) <= 24 else f"{name[:21]}..." for name in (shot, reference))
     return contact_sheet(
@@ -212,7 +218,10 @@ def difference_picture(differences: Differences, shot: str, reference: str) -> P
 
 
 def _difference_panels(differences: Differences) -> dict[str, tuple[Map, float, str]]:
-    """Return values in the units of the fields, the difference of full color, and a label, by layer."""
+    """Return the panels of differences by name.
+
+    Each panel has values in the unit of its field, the difference that gets the most saturated color, and a label.
+    """
     return {
         "s0_difference": (differences.s0, S0_RANGE, "S0"),
         "dolp_difference": (differences.dolp, DOLP_RANGE, "DoLP"),
@@ -221,7 +230,10 @@ def _difference_panels(differences: Differences) -> dict[str, tuple[Map, float, 
 
 
 def diverging(values: Map, most: float) -> Picture:
-    """Convert numbers to colors: blue at ``-most``, light at 0, red at ``most``, gray for NaN; uint8 RGB [H, W, 3]."""
+    """Convert numbers to colors, uint8 RGB [H, W, 3].
+
+    Colors are blue at ``-most``, light at 0, red at ``most``, and gray for NaN.
+    """
     finite = np.isfinite(values)
     place = np.clip(np.where(finite, values, 0) / most, -1, 1)[..., None]
     fall = np.where(place > 0, np.array([62, 216, 197], np.float32), np.array([207, 138, 68], np.float32))
@@ -231,7 +243,7 @@ def diverging(values: Map, most: float) -> Picture:
 
 
 def _bar(most: float) -> Picture:
-    """Draw the colors with their numbers below."""
+    """Draw the color scale, with its numbers below."""
     bar: Picture = np.full((44, _BAR, 3), 255, np.uint8)
     bar[:22] = diverging(np.linspace(-most, most, _BAR, dtype=np.float32)[None].repeat(22, axis=0), most)
     for text, share in ((f"-{most:g}", 0.0), ("0", 0.5), (f"+{most:g}", 1.0)):

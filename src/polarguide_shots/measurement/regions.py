@@ -1,4 +1,4 @@
-"""Regions of interest, their figures in a shot, and differences to a golden part."""
+"""Measure regions of interest in a shot, and compare them with a reference part."""
 
 from __future__ import annotations
 
@@ -24,24 +24,26 @@ from polarguide_shots.options import ShotOptions
 from polarguide_shots.read import read_shot
 
 WHOLE = "all"
-"""Name of the default region, the whole picture."""
+"""Name of the default region, which is the whole picture."""
 _NAME = r"(?:(?P<name>[^=]*)=)?"
 _FORM = re.compile(_NAME + r"(?P<numbers>-?[0-9]{1,9}(?:,-?[0-9]{1,9}){3})")
 _POLYGON = re.compile(_NAME + r"(?P<corners>[0-9]{1,7},[0-9]{1,7}(?:;[0-9]{1,7},[0-9]{1,7}){2,99})")
 _OUTSIDE = 255
-"""Placeholder of a ``Reason`` for pixels of a rectangle outside of its polygon."""
+"""Placeholder in a map of reasons for pixels outside of the polygon of a region."""
 _LONGEST_NAME = 64
 _MOST = 1_000_000
 
 
 @dataclass(frozen=True)
 class Region:
-    """A rectangle of pixels, or a polygon in it.
+    """A region of interest: a rectangle of pixels, or a polygon inside of it.
 
     Attributes:
         name: name of the region.
-        x, y: left column and top row of the rectangle.
-        width, height: size of the rectangle.
+        x: left column of the rectangle.
+        y: top row of the rectangle.
+        width: width of the rectangle.
+        height: height of the rectangle.
         corners: corners of the polygon relative to the rectangle's top-left corner; empty for a rectangle.
     """
 
@@ -54,20 +56,20 @@ class Region:
 
     @property
     def inside(self) -> NDArray[np.bool_] | None:
-        """Mask of the pixels whose centers are in the polygon, [height, width]; None: all pixels."""
+        """Mask [height, width] of the pixels whose centers are in the polygon. None if the region is a rectangle."""
         return _filled(self.corners, self.width, self.height) if self.corners else None
 
     @property
     def place(self) -> tuple[slice, slice]:
-        """Rows and columns of the rectangle."""
+        """Slices of the rows and columns of the rectangle."""
         return slice(self.y, self.y + self.height), slice(self.x, self.x + self.width)
 
 
 @lru_cache(maxsize=64)
 def _filled(corners: tuple[tuple[int, int], ...], width: int, height: int) -> NDArray[np.bool_]:
-    """Return a mask of the pixels with an odd number of edges of a polygon to their right, [height, width].
+    """Return a mask [height, width] of the pixels inside a polygon.
 
-    The mask is cached and must not be modified.
+    A pixel is inside if an odd number of edges is to its right. The mask is cached and must not be modified.
     """
     y, x = np.mgrid[0:height, 0:width] + 0.5
     inside = np.zeros((height, width), bool)
@@ -78,12 +80,12 @@ def _filled(corners: tuple[tuple[int, int], ...], width: int, height: int) -> ND
 
 
 def parse_regions(texts: Sequence[str]) -> tuple[Region, ...]:
-    """Parse regions ``x,y,width,height`` or corners ``x,y;x,y;x,y`` of a polygon, optionally with ``name=`` before.
+    """Parse regions ``x,y,width,height``, or polygons ``x,y;x,y;x,y``. A prefix ``name=`` is optional.
 
     Regions without a name are called roi1, roi2, ... by their position.
 
     Raises:
-        PolarguideError: a text is invalid, a region has no pixel, or two regions have one name.
+        PolarguideError: a text is invalid, a region has no pixel, or two regions have the same name.
     """
     regions: dict[str, Region] = {}
     for number, text in enumerate(texts, 1):
@@ -100,7 +102,7 @@ def parse_regions(texts: Sequence[str]) -> tuple[Region, ...]:
 
 
 def _parse(text: str, number: int) -> Region:
-    """Parse one region; ``number`` is its position.
+    """Parse one region. ``number`` is its position in the list, which names it if it has no name.
 
     Raises:
         PolarguideError: the text is invalid, or the region has no pixel.
@@ -144,7 +146,7 @@ def _wrong(expected: str, found: str) -> PolarguideError:
 
 
 def placed(regions: Sequence[Region], size: tuple[int, int], where: Path | str) -> tuple[Region, ...]:
-    """Return the regions of a picture, by default the whole picture.
+    """Return the regions of a picture. If no regions are requested, return one region for the whole picture.
 
     Args:
         regions: the requested regions.
@@ -167,7 +169,7 @@ def placed(regions: Sequence[Region], size: tuple[int, int], where: Path | str) 
 
 
 def box_of(regions: Sequence[Region]) -> Part | None:
-    """Return the smallest rectangle around regions, or None without regions."""
+    """Return the smallest rectangle that contains all regions, or None if there are no regions."""
     if not regions:
         return None
     left, top = np.min([(r.x, r.y) for r in regions], axis=0).tolist()
@@ -179,21 +181,21 @@ Floats = NDArray[np.floating[Any]]
 
 
 def region_figures(maps: ShotMaps, region: Region, threshold: float) -> dict[str, Value]:
-    """Compute counts, S0, DoLP and AoLP of a region.
+    """Compute statistics of S0, DoLP and AoLP in a region, and numbers of its pixels.
 
-    Means and standard deviations (over n, not n - 1) are computed in float64. AoLP is axial. Let C = mean cos 2a and
-    S = mean sin 2a over usable pixels, and R = sqrt(C^2 + S^2). The mean is atan2(S, C) / 2, and the standard deviation
-    is sqrt(-2 ln R) / 2 (Mardia and Jupp 2000, "Directional Statistics"). Standard errors of means contain the noise of
-    the sensor only, and consider that interpolated pixels share samples.
+    Means and standard deviations (over n, not n - 1) are computed in float64. AoLP is axial. Let C = mean cos 2a and S
+    = mean sin 2a over usable pixels, and R = sqrt(C^2 + S^2). The mean is atan2(S, C) / 2, and the standard deviation
+    is sqrt(-2 ln R) / 2 (Mardia and Jupp 2000, "Directional Statistics"). Standard errors of means contain only the
+    noise of the sensor. They take into account that interpolated pixels share samples.
 
     Args:
-        maps: the shot.
-        region: region within its size.
+        maps: maps of the shot.
+        region: region inside the maps.
         threshold: DoLP above which pixels count in ``dolp_share``.
 
     Returns:
-        Values by ``Field.key``, from ``pixels`` to ``aolp_concentration``, with angles in degrees; None for a figure
-        without a pixel.
+        Values by ``Field.key``, from ``pixels`` to ``aolp_concentration``, with angles in degrees. Values that cannot
+        be computed, because no pixel is usable, become None.
     """
     at = region.place
     reason = maps.reason[at]
@@ -223,12 +225,15 @@ def region_figures(maps: ShotMaps, region: Region, threshold: float) -> dict[str
 
 
 def _chosen(values: Floats, mask: NDArray[np.bool_]) -> Floats:
-    """Return the values of a mask, without a copy if the mask is full."""
+    """Return the values inside a mask. If the mask is full, no copy is made."""
     return values.ravel() if mask.all() else values[mask]
 
 
 def _error_of_mean(maps: ShotMaps, deviations: Floats) -> float | None:
-    """Return the standard error of a mean over pixels with these standard deviations; None without pixels."""
+    """Return the standard error of a mean over pixels, given the standard deviation of each pixel.
+
+    Return None if there are no pixels.
+    """
     if not deviations.size:
         return None
     shared = 1.0 if maps.mean_variance is None else maps.mean_variance / maps.pixel_variance
@@ -260,7 +265,10 @@ def _angles(aolp: Floats, error: float | None) -> dict[str, Value]:
 
 
 def axial_mean(angles: Floats) -> tuple[float, float]:
-    """Return the circular mean of angles modulo pi, in [-pi/2, pi/2], and the resultant length of doubled angles."""
+    """Return the circular mean of angles modulo pi, and the concentration of the angles.
+
+    The mean is in [-pi/2, pi/2]. The concentration is the resultant length of the doubled angles, in [0, 1].
+    """
     doubled = 2 * angles
     cosine = np.cos(doubled).mean(dtype=np.float64)
     sine = np.sin(doubled).mean(dtype=np.float64)
@@ -269,11 +277,12 @@ def axial_mean(angles: Floats) -> tuple[float, float]:
 
 @dataclass(frozen=True, eq=False)
 class Differences:
-    """Differences of a shot and the reference, which are not registered.
+    """Differences between the maps of a shot and of the reference, pixel by pixel, without registration.
 
     Attributes:
-        s0, dolp: [H, W]; NaN if a pixel is not measured in both. The DoLP is debiased.
-        aolp: [H, W] radians in [-pi/2, pi/2]; NaN if a pixel is not usable in both.
+        s0: [H, W] difference of S0. NaN if the pixel is not measured in both shots.
+        dolp: [H, W] difference of the debiased DoLP. NaN if the pixel is not measured in both shots.
+        aolp: [H, W] difference of AoLP, radians in [-pi/2, pi/2]. NaN if the pixel is not usable in both shots.
     """
 
     s0: Map
@@ -282,7 +291,7 @@ class Differences:
 
 
 def subtract(maps: ShotMaps, golden: ShotMaps) -> Differences:
-    """Subtract the maps of the golden part from the maps of a shot.
+    """Subtract the maps of the reference part from the maps of a shot.
 
     Raises:
         PolarguideError: the sizes differ.
@@ -292,7 +301,7 @@ def subtract(maps: ShotMaps, golden: ShotMaps) -> Differences:
         maps.files[0] if maps.files else maps.name,
         expected=f"{golden.size[0]}x{golden.size[1]} pixels like the reference {golden.name}",
         found=f"{maps.size[0]}x{maps.size[1]}",
-        remedy="Take both with one camera and one region, and develop them alike.",
+        remedy="Take both shots with the same camera and region, and develop them with the same options.",
     )
     reason = np.maximum(maps.reason, golden.reason)
     angle = np.remainder(maps.aolp - golden.aolp + math.pi / 2, math.pi) - math.pi / 2
@@ -305,14 +314,14 @@ def subtract(maps: ShotMaps, golden: ShotMaps) -> Differences:
 
 
 def read_reference(path: Path, options: ShotOptions) -> ShotMaps:
-    """Read the maps of a golden part, without its intensities.
+    """Read the maps of a reference part. Its intensities are not kept.
 
     Args:
         path: path of a mosaic, of one of four shots through a filter, or of a folder with one shot.
         options: options of the shots.
 
     Raises:
-        PolarguideError: the path is not one shot, or cannot be read.
+        PolarguideError: the path does not contain exactly one shot, or it cannot be read.
     """
     if path.is_file() and options.sensor is None:
         file = path.resolve()
@@ -325,14 +334,17 @@ def read_reference(path: Path, options: ShotOptions) -> ShotMaps:
         "--reference",
         expected="one shot",
         found=f"{len(shots)} in {path}",
-        remedy="Name a file of the shot.",
+        remedy="Specify one file of the shot.",
     )
     maps = read_shot(shots[0], options)
     return replace(maps, intensities=maps.intensities[:, :0].copy())
 
 
 def difference_figures(differences: Differences | None, region: Region) -> dict[str, Value]:
-    """Return the figures of differences in a region, from ``compared`` on; None without a reference."""
+    """Return statistics of the differences in a region by ``Field.key``. The first key is ``compared``.
+
+    Without a reference, each value equals None.
+    """
     figures: dict[str, Value] = dict.fromkeys(COMPARED)
     if differences is None:
         return figures

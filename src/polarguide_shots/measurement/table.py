@@ -1,8 +1,8 @@
-"""The table of measured shots: fields, limits files, and the files on disk.
+"""The table of measured shots: its fields, its limits files, and its files on disk.
 
-``table.jsonl`` has one line per shot, with all regions and files. It is both the table and the journal of measured
-shots. A line is written at once and forced to disk before the next step. The next start removes an incomplete line, and
-its shot is measured again. No line is lost or repeated if the process is killed.
+``table.jsonl`` has one line per shot, with all regions and files. It is the table, and also the journal that prevents a
+shot from being measured twice. A line is written at once and forced to disk before the next step. If the process is
+killed, the next start removes an incomplete line, and its shot is measured again. No line is lost or repeated.
 ``table.csv`` has one line per region. It is written after ``table.jsonl`` and recreated from it at every start.
 """
 
@@ -39,11 +39,11 @@ from polarguide.core.system import only_writer
 from polarguide.core.text import csv_lines
 
 FORMAT = 2
-"""Version of the table. Any change of the name, order or meaning of fields increases it."""
+"""Version of the table. It increases whenever the name, order or meaning of a field changes."""
 PERCENTILES = (1, 5, 50, 95, 99)
-"""Percentiles of S0 and DoLP."""
+"""Percentiles of S0 and DoLP that are in the table."""
 DIFFERENCE_PERCENTILE = 99
-"""Percentile of absolute differences."""
+"""Percentile of the absolute differences from the reference that is in the table."""
 Value = int | float | str | None
 
 Status = Literal["measured", "within", "beyond", "unread"]
@@ -51,13 +51,13 @@ Status = Literal["measured", "within", "beyond", "unread"]
 
 @dataclass(frozen=True)
 class Field:
-    """A field of the table.
+    """Description of a field of the table.
 
     Attributes:
-        key: name.
-        unit: unit of the numbers; empty without a unit.
+        key: name of the field.
+        unit: unit of the numbers. Empty if they have no unit.
         about: description.
-        bounded: True if a limits file may bound the field.
+        bounded: True if a limits file may contain a limit for the field.
     """
 
     key: str
@@ -121,20 +121,20 @@ FIELDS = (
     *_difference("dolp", "", "debiased DoLP", "mean"),
     *_difference("aolp", "degrees", "AoLP", "circular mean", ", -90 to 90"),
 )
-"""Fields in the order of the columns. A missing value is an empty cell, in JSON null."""
+"""Fields in the order of the columns. A missing value is an empty cell in CSV, and null in JSON."""
 KEYS = tuple(field.key for field in FIELDS)
-"""Names of the fields."""
+"""Names of the fields of the table, in the order of the columns."""
 BOUNDED = tuple(field.key for field in FIELDS if field.bounded)
-"""Names of the fields that a limits file may bound."""
+"""Names of the fields for which a limits file may contain a limit."""
 COMPARED = KEYS[KEYS.index("compared") :]
-"""Names of the fields that need a reference."""
+"""Names of the fields that are only measured if there is a reference."""
 AXIAL = ("aolp_mean",)
-"""Names of the fields with a period of 180 degrees."""
+"""Names of the fields whose values are angles with a period of 180 degrees."""
 _REMEDY = "Correct the file."
 
 
 class Bound(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
-    """Smallest and largest allowed value; None: no bound."""
+    """Smallest and largest allowed value of a field. None means that there is no limit on this side."""
 
     min: float | None = None
     max: float | None = None
@@ -146,7 +146,7 @@ class Limits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     Attributes:
         format: version of the file, 1.
         limits: bounds by field, for all regions.
-        regions: bounds by region and field, which replace those in ``limits``.
+        regions: bounds by region and field. They replace the bounds in ``limits``.
     """
 
     format: int = 1
@@ -154,12 +154,12 @@ class Limits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     regions: dict[str, dict[str, Bound]] = {}
 
     def of(self, region: str) -> dict[str, Bound]:
-        """Return the bounds of a region, by field."""
+        """Return the bounds that apply to a region, by field."""
         return {**self.limits, **self.regions.get(region, {})}
 
 
 NO_LIMITS = Limits()
-"""Limits without a bound."""
+"""Limits that allow all values."""
 
 
 def read_limits(path: Path, regions: Collection[str], *, reference: bool) -> Limits:
@@ -171,7 +171,7 @@ def read_limits(path: Path, regions: Collection[str], *, reference: bool) -> Lim
         reference: True if shots are compared with a reference.
 
     Raises:
-        PolarguideError: the file cannot be read, a field or region is unknown, or the file has no bound.
+        PolarguideError: the file cannot be read, a field or region is unknown, or the file contains no limit.
     """
     limits = read_record(path, Limits, remedy=_REMEDY)
     _require(limits.format == 1, f"{path} (format)", "1", str(limits.format))
@@ -187,7 +187,7 @@ def read_limits(path: Path, regions: Collection[str], *, reference: bool) -> Lim
 
 
 def _check(where: str, field: str, bound: Bound, reference: bool) -> None:
-    """Validate the bound of a field.
+    """Check that a limits file may contain a bound for a field, and that the bound is valid.
 
     Raises:
         PolarguideError: the field is unknown or needs a reference, or the bound is invalid.
@@ -216,7 +216,7 @@ def _require(condition: object, where: str, expected: str, found: str, remedy: s
 
 
 def faults(figures: Mapping[str, Value], bounds: Mapping[str, Bound]) -> list[str]:
-    """Describe the figures that are beyond their bounds. A missing value is beyond a bound."""
+    """Describe each value that is outside of its bounds. A missing value counts as outside."""
     beyond = []
     for field, bound in bounds.items():
         value = figures[field]
@@ -234,7 +234,7 @@ def faults(figures: Mapping[str, Value], bounds: Mapping[str, Bound]) -> list[st
 
 
 def verdict(beyond: Sequence[str], bounds: Mapping[str, Bound]) -> dict[str, Value]:
-    """Return the status of a region, and the exceeded limits."""
+    """Return the fields of a region for its status and its exceeded limits."""
     return {
         "status": "beyond" if beyond else "within" if bounds else "measured",
         "why": ", ".join(beyond),
@@ -242,7 +242,7 @@ def verdict(beyond: Sequence[str], bounds: Mapping[str, Bound]) -> dict[str, Val
 
 
 def worst(regions: Sequence[Mapping[str, Value]]) -> Status:
-    """Return the worst status of regions."""
+    """Return the worst status among regions."""
     statuses = [figures["status"] for figures in regions]
     return "beyond" if "beyond" in statuses else "within" if "within" in statuses else "measured"
 
@@ -252,12 +252,12 @@ CSV = "table.csv"
 SETTINGS = "measure.json"
 LOCK = ".lock"
 _LAST = 2**63 - 1
-"""Largest time in nanoseconds since 1970, 292 years. Some disks have later times."""
+"""Largest time of a file in nanoseconds since 1970. Later times, which some disks state, are replaced by it."""
 _REPLACE = "Give another --out, or --overwrite to replace this table."
 
 
 class FileStamp(msgspec.Struct, frozen=True):
-    """State of a file: path, size in bytes, and time of its last change in nanoseconds."""
+    """Identity of a file, to detect changes: path, size in bytes, and time of its last change in nanoseconds."""
 
     path: str
     bytes: int
@@ -265,7 +265,7 @@ class FileStamp(msgspec.Struct, frozen=True):
 
 
 def stamps(paths: Sequence[Path]) -> tuple[FileStamp, ...]:
-    """Return the current state of files.
+    """Return the current ``FileStamp`` of each file.
 
     Raises:
         OSError: a file is missing.
@@ -277,17 +277,17 @@ def stamps(paths: Sequence[Path]) -> tuple[FileStamp, ...]:
 
 
 class Entry(msgspec.Struct, frozen=True):
-    """One line of ``table.jsonl``.
+    """One line of ``table.jsonl``: the result for one shot.
 
     Attributes:
         format: ``FORMAT``.
         shot: name of the shot.
-        files: files of the shot.
-        status: worst status of the regions; "unread" for a shot that could not be read.
-        why: reason of an unread shot, else empty.
+        files: stamps of the files of the shot.
+        status: worst status of the regions, or "unread" for a shot that could not be read.
+        why: error of an unread shot, else empty.
         notes: assumptions about the shot.
-        regions: figures of the regions by ``Field.key``, from ``region`` on.
-        picture: name of the pictures without suffix; empty without pictures.
+        regions: measured values of each region by ``Field.key``. The first key is ``region``.
+        picture: name of the pictures without suffix. Empty if there are no pictures.
     """
 
     format: int
@@ -300,11 +300,11 @@ class Entry(msgspec.Struct, frozen=True):
     picture: str = ""
 
     def line(self) -> bytes:
-        """Return the line of ``table.jsonl``. Escapes of JSON keep names that are not valid Unicode."""
+        """Return the line of ``table.jsonl``. Names that are not valid Unicode are preserved by escapes of JSON."""
         return json.dumps(msgspec.to_builtins(self)).encode() + b"\n"
 
     def rows(self) -> Iterator[list[Value]]:
-        """Return the lines of the CSV table."""
+        """Return the lines of ``table.csv``, one for each region."""
         taken = ""
         if self.files:
             newest = datetime.fromtimestamp(max(file.modified for file in self.files) / 1e9, timezone.utc)
@@ -316,21 +316,22 @@ class Entry(msgspec.Struct, frozen=True):
 
 
 class Table(contextlib.AbstractContextManager["Table"]):
-    """An open table. The context manager closes it.
+    """A table that is open for writing. The context manager closes it.
 
     Args:
         folder: folder to create.
-        settings: all settings that the figures depend on, which are equal for all shots of a table.
-        overwrite: replace a table with other settings. A table without a measured shot is always replaced.
-        judge: function that compares a line with the limits of the settings, for a table with other limits.
+        settings: all settings that influence the measured values. They must be equal for all shots of a table.
+        overwrite: True to replace a table with other settings. A table without a measured shot is always replaced.
+        judge: function that compares a line with the limits of the settings. It is called for each line if the table
+            was written with other limits.
 
     Attributes:
         judged_again: number of lines that were compared with new limits.
         close: release the table for other processes.
 
     Raises:
-        PolarguideError: another process writes the table, it has other settings, it is damaged before its end, or it
-            cannot be written.
+        PolarguideError: another process writes the table, it has other settings, a line before its end is damaged, or
+            it cannot be written.
     """
 
     def __init__(
@@ -366,19 +367,22 @@ class Table(contextlib.AbstractContextManager["Table"]):
         self.close()
 
     def entry_of(self, files: tuple[FileStamp, ...]) -> Entry | None:
-        """Return the line of files in their current state, or None. Only a line beyond its limits has figures."""
+        """Return the line of some files, or None if the files are not in the table or have changed.
+
+        Only a line whose status is "beyond" has measured values.
+        """
         return self._done.get(_key(files))
 
     def picture_name(self, shot: str) -> str:
-        """Return a new name for the pictures of a shot, unique without regard to case."""
+        """Return a new name for the pictures of a shot. It is unique even if case is ignored."""
         names = itertools.chain((shot,), (f"{shot}-{number}" for number in itertools.count(2)))
         return next(name for name in names if name.casefold() not in self._pictures)
 
     def add(self, entry: Entry) -> Entry:
-        """Write the lines of a shot, force them to disk, and return the entry.
+        """Write the line of a shot, force it to disk, and return the entry.
 
         Raises:
-            PolarguideError: the lines cannot be written, as on a full disk, or the table was removed.
+            PolarguideError: the line cannot be written, for example because the disk is full, or the table was removed.
         """
         self.require_present()
         lines, rows = self._files
@@ -388,7 +392,7 @@ class Table(contextlib.AbstractContextManager["Table"]):
         return entry
 
     def require_present(self) -> None:
-        """Check that the open files still exist under their names. A removed file would lose lines silently.
+        """Check that the open files still exist under their names. Lines in a removed file would be lost silently.
 
         Raises:
             PolarguideError: a file was removed, renamed or replaced.
@@ -407,7 +411,7 @@ class Table(contextlib.AbstractContextManager["Table"]):
             )
 
     def _record(self, entry: Entry) -> None:
-        """Keep a line in memory, with figures if it is beyond its limits."""
+        """Keep a line in memory. Measured values are only kept if its status is "beyond"."""
         short = entry if entry.status == "beyond" else msgspec.structs.replace(entry, regions=(), notes=())
         self._done[_key(entry.files)] = short
         if entry.picture:
@@ -448,7 +452,7 @@ class Table(contextlib.AbstractContextManager["Table"]):
                     f"{path} ({name[1:]})",
                     expected=shortened(was, 200),
                     found=shortened(requested, 200),
-                    remedy=f"One table has one set of options. {_REPLACE}",
+                    remedy=f"All shots of a table need the same options. {_REPLACE}",
                 )
         elif not overwrite:
             require(
@@ -502,7 +506,7 @@ class Table(contextlib.AbstractContextManager["Table"]):
                 os.fsync(file.fileno())
 
     def _judge(self, judge: Callable[[Entry], Entry]) -> None:
-        """Compare all lines with new limits, and replace them."""
+        """Compare all lines with new limits, and rewrite the file."""
         path = self.folder / LINES
         with atomic(path) as temporary, open(temporary, "wb") as new, open(path, "rb") as lines:
             for number, line in enumerate(lines, 1):

@@ -1,4 +1,4 @@
-"""Measurement of the shots of a watched folder, each once, as soon as its files are complete."""
+"""Measure the shots of a watched folder, each once, as soon as its files are complete."""
 
 from __future__ import annotations
 
@@ -26,18 +26,18 @@ from polarguide_shots.read import UNREADABLE
 from polarguide_shots.sets import ExposureSet
 
 _POLL = (0.05, 0.5)
-"""Smallest and largest interval of searches in seconds. A slow search increases it."""
+"""Smallest and largest interval between two searches, in seconds. Slow searches have larger intervals."""
 
 
 @dataclass
 class _Pending:
-    """A shot that is not in the table.
+    """State of a shot that has not been measured yet.
 
     Attributes:
-        files: state of the files at the last search.
-        since: time of their last change.
-        truncated: reading failed because a file may be incomplete.
-        reported: a warning on missing files was given.
+        files: stamps of the files at the last search.
+        since: time of the last change of a file.
+        truncated: True if reading failed because a file may be incomplete.
+        reported: True if a warning about missing files was printed.
     """
 
     files: tuple[FileStamp, ...]
@@ -48,7 +48,7 @@ class _Pending:
 
 @dataclass
 class _Folder:
-    """Search of a watched folder.
+    """Searches a watched folder for shots.
 
     Attributes:
         root: the folder.
@@ -84,11 +84,11 @@ class _Folder:
         return mosaics([path for path in files if not path.name.startswith(".") and path.is_file()])
 
     def trouble(self) -> str:
-        """Return the reason why no shot was found in a folder that is not empty; else an empty string."""
+        """Return the reason why no shot was found in a folder that is not empty. Otherwise return an empty string."""
         return self._error[0] if self._error[0] and self._has_files() else ""
 
     def _keep(self, error: PolarguideError | OSError) -> None:
-        """Record an error, and report it once after the patience."""
+        """Record an error, and report it once if it persists longer than the patience."""
         text = str(error)
         if isinstance(error, OSError):
             found = error.strerror or text
@@ -101,7 +101,7 @@ class _Folder:
             self.reporter.warn(text)
 
     def _has_files(self) -> bool:
-        """Return True unless the folder is readable and empty."""
+        """Return False if the folder is readable and empty, else True."""
         with contextlib.suppress(OSError):
             return any(not path.name.startswith(".") for path in self.root.iterdir())
         return True
@@ -120,16 +120,16 @@ def watch_folder(
 ) -> Outcome:
     """Measure the shots of a folder as they arrive, until ``should_stop`` returns True.
 
-    A shot is measured when none of its files has changed for ``settle`` seconds and all are complete. An incomplete
-    file is retried. After ``patience`` seconds without a change, the table gets a line with the error of the shot, also
-    for an ambiguous file or a file without an angle in its name.
+    A shot is measured when all its files are complete and unchanged for ``settle`` seconds. An incomplete file is
+    retried. After ``patience`` seconds without a change, the error of the shot is written to the table. The same
+    applies to an ambiguous file, and to a file without an angle in its name.
 
     A shot with fewer than four files waits. A warning follows after ``patience`` seconds, and the shot is in
     ``Outcome.waiting`` at the end. A set at other angles is measured when its angles are evenly spaced over half a turn
-    or all files of ``angles.csv`` exist. Other sets are measured after ``patience`` seconds without a change.
+    or all files of ``angles.csv`` exist. If neither holds, it is measured after ``patience`` seconds without a change.
 
-    A rewritten file is a new shot. The same call after a stop or a kill resumes with the shots that are not in the
-    table.
+    A rewritten file is a new shot. If the process stops or is killed, the same call continues with the shots that are
+    not in the table.
 
     Args:
         folder: folder of mosaics or of shots through a filter (see ``find_shots``).
@@ -137,7 +137,7 @@ def watch_folder(
         options: quantities to measure, and their limits.
         reading: options of reading.
         watching: intervals.
-        should_stop: callback between two shots and several times per second.
+        should_stop: function that returns True to stop. It is called between two shots and several times per second.
         heard: callback for each shot after its line is on disk.
         reporter: receiver of messages.
 
@@ -172,10 +172,10 @@ def watch_folder(
 
 
 class _Watch:
-    """State of the shots of a watched folder.
+    """Decides when the shots of a watched folder are measured.
 
     Attributes:
-        pending: shots that are not in the table, by name.
+        pending: shots that have not been measured yet, by name.
     """
 
     def __init__(self, line: Line, options: WatchOptions, reporter: Reporter) -> None:
@@ -186,7 +186,7 @@ class _Watch:
         self._changed = time.monotonic()
 
     def measure(self, shots: Sequence[ExposureSet]) -> Iterator[Entry]:
-        """Measure the complete shots, the oldest first, and return each line after it is on disk."""
+        """Measure the complete shots, the oldest first. Yield each line after it is on disk."""
         pending: dict[str, _Pending] = {}
         ready = []
         for shot in shots:
@@ -212,7 +212,7 @@ class _Watch:
                 yield entry
 
     def _is_ready(self, shot: ExposureSet, state: _Pending) -> bool:
-        """Return True if a shot is to be measured now."""
+        """Return True if a shot can be measured now."""
         age = time.monotonic() - state.since
         late = age >= self._options.patience
         missing = [str(angle) for angle in ANGLES if angle not in shot.files]
@@ -232,7 +232,10 @@ class _Watch:
         return False
 
     def _measure(self, shot: ExposureSet, state: _Pending) -> Entry | None:
-        """Measure a shot, or write a line with its error; None if it has changed or may be incomplete."""
+        """Measure a shot, or write a line with its error.
+
+        Return None if the shot has changed since the search, or if its files may be incomplete.
+        """
         try:
             return self._line.measure(shot, state.files) if stamps(shot.paths) == state.files else None
         except ChangedWhileRead:
@@ -247,12 +250,15 @@ class _Watch:
             return None if changed or state.truncated else self._line.unread(shot, state.files, error)
 
     def idle(self) -> bool:
-        """Return True after the time to stop without a change, unless a file may still settle."""
+        """Return True if nothing has changed for the ``idle`` time. Return False while a file may still change."""
         quiet = time.monotonic() - self._changed
         return 0 < self._options.idle <= quiet and quiet > self._options.settle + 2 * _POLL[1]
 
 
 def _is_complete(path: Path) -> bool:
-    """Return True for a table, or a complete PNG, JPEG or TIFF; False if the format does not show its end."""
+    """Return True if a file is a table, or a complete PNG, JPEG or TIFF file.
+
+    Return False for formats that do not show whether a file is complete.
+    """
     suffix = path.suffix.lower()
     return suffix == ".csv" or (suffix in SUFFIXES and find_damage(path.read_bytes()) is None)
