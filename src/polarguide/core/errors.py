@@ -42,7 +42,8 @@ def require(condition: object, where: object, *, expected: str, found: str, reme
     """Check a condition on input.
 
     Args:
-        condition: the condition. where, expected, found, remedy: as for ``PolarguideError``.
+        condition: the condition.
+        where, expected, found, remedy: as for ``PolarguideError``.
 
     Raises:
         PolarguideError: the condition does not hold.
@@ -105,7 +106,8 @@ class Requirement(NamedTuple):
     """Requirement in polarguide's installed metadata.
 
     Attributes:
-        name: name of the distribution. text: name and versions, such as ``viser==1.1.*``.
+        name: name of the distribution.
+        text: name and versions, such as ``viser==1.1.*``.
         extra: extra that includes it; empty: polarguide always requires it.
         conditional: True if only some systems or versions of Python require it.
     """
@@ -153,7 +155,8 @@ def optional_import(module: str, what: str) -> Any:
     The handler of Ctrl-C is restored, because libraries such as dask_jobqueue replace it.
 
     Args:
-        module: name of the module. what: verb or option that needs it, for the message.
+        module: name of the module.
+        what: verb or option that needs it, for the message.
 
     Raises:
         PolarguideError: the package is not installed.
@@ -182,7 +185,8 @@ def import_part(module: str, what: str) -> Any:
     """Import a module of this package or of another package of the same distribution.
 
     Args:
-        module: full name, such as "polarguide_shots.verbs". what: verb or name that needs it, for the message.
+        module: full name, such as "polarguide_shots.verbs".
+        what: verb or name that needs it, for the message.
 
     Raises:
         PolarguideError: the package is not installed.

@@ -251,7 +251,8 @@ def scale_bar(low: float, high: float, colormap: str, unit: str = "", *, middle:
     """Draw the color scale of ``scalar_to_rgb`` with both limits below: uint8 RGB [44, 256, 3].
 
     Args:
-        unit: unit of the limits. middle: label at the middle of the bar.
+        unit: unit of the limits.
+        middle: label at the middle of the bar.
     """
     ramp = torch.linspace(low, high, 256).expand(22, -1)
     end = f"{high:g} {unit}".rstrip()

@@ -48,7 +48,8 @@ def page(package: str, name: str, *, script: str = "", more: str = "", **values:
     """Render an HTML page from a template that extends ``base.html``.
 
     Args:
-        package, name: the template. script: content of the page's script element; empty forbids scripts.
+        package, name: the template.
+        script: content of the page's script element; empty forbids scripts.
         more: additional sources of scripts; further directives follow a semicolon.
         values: values of the template, at least ``title``.
     """

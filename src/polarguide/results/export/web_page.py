@@ -264,11 +264,13 @@ def share_page(
 
     Args:
         gaussians: the Gaussians.
-        light: parameters of the learned light by name. shading: shading model with the run's refractive
-            index.
-        cameras: poses by name, at least one. first: name of the initial pose.
+        light: parameters of the learned light by name.
+        shading: shading model with the run's refractive index.
+        cameras: poses by name, at least one.
+        first: name of the initial pose.
         title, caption: any text; the page escapes it.
-        metrics: labels and values, any text. notes: paragraphs before the metrics, any text.
+        metrics: labels and values, any text.
+        notes: paragraphs before the metrics, any text.
         presentation: color, up axis, scale and credit.
         footprints: [N] footprints of the training, see ``raster.magnification``; None if unknown.
         gloss: factor on the brightness of the separate specular layer.

@@ -46,9 +46,14 @@ class Baked:
     """Values of M texels, single precision.
 
     Attributes:
-        color: [M, 3] linear. roughness: [M] of glTF. metalness: [M]. strength: [M] of the reflection.
-        reflectance: [M, 3] of metals at normal incidence. index: [M] refractive index.
-        normal: [M, 3] learned, not normalized. seen: [M] bool, texels that some view shows.
+        color: [M, 3] linear.
+        roughness: [M] of glTF.
+        metalness: [M].
+        strength: [M] of the reflection.
+        reflectance: [M, 3] of metals at normal incidence.
+        index: [M] refractive index.
+        normal: [M, 3] learned, not normalized.
+        seen: [M] bool, texels that some view shows.
         nearest: [U] index of the nearest seen texel of each other texel, whose values it has.
         added: [M, C] values in [0, 1] of surface properties with their own texture.
     """
@@ -98,8 +103,11 @@ def bake(
     """Sample the views at points of the surface.
 
     Args:
-        run: the run. views: views to sample. places, normals: [M, 3] in the scene, unit normals.
-        color: the sampled layer or the photographs. voxel: side of a voxel of the fusion.
+        run: the run.
+        views: views to sample.
+        places, normals: [M, 3] in the scene, unit normals.
+        color: the sampled layer or the photographs.
+        voxel: side of a voxel of the fusion.
         reporter: receives progress.
     """
     model = run.model

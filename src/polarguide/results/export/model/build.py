@@ -77,9 +77,11 @@ class Charted:
     """Subject of a run as a mesh with texture coordinates.
 
     Attributes:
-        mesh: the mesh with colors of the diffuse layer. inside: region of the subject. voxel: side of a voxel
-            of the fusion.
-        unwrapped: the mesh, split along the borders of charts. texels: texels of the texture.
+        mesh: the mesh with colors of the diffuse layer.
+        inside: region of the subject.
+        voxel: side of a voxel of the fusion.
+        unwrapped: the mesh, split along the borders of charts.
+        texels: texels of the texture.
     """
 
     mesh: ColoredMesh
@@ -101,10 +103,13 @@ def charted_subject(
     """Return the surface of the subject with texture coordinates.
 
     Args:
-        run: the run; its scene is read. surface_view: renders a view of the subject's Gaussians.
-        inside: region of the subject; None for everything. options: options of the model.
+        run: the run; its scene is read.
+        surface_view: renders a view of the subject's Gaussians.
+        inside: region of the subject; None for everything.
+        options: options of the model.
         resolution: number of voxels along its longest side.
-        folder: folder for temporary files. reporter: receives progress, counts and warnings.
+        folder: folder for temporary files.
+        reporter: receives progress, counts and warnings.
 
     Raises:
         PolarguideError: a package is missing, the texture does not fit into memory, there is no surface, or
@@ -132,9 +137,11 @@ def textured_model(
     """Return the subject of a run as a textured mesh, +y up.
 
     Args:
-        run: the run; its scene is read. subject: its surface. presentation, placement: color, and scale of
-            the file.
-        options: options of the model. reporter: receives progress and counts.
+        run: the run; its scene is read.
+        subject: its surface.
+        presentation, placement: color, and scale of the file.
+        options: options of the model.
+        reporter: receives progress and counts.
     """
     mesh = subject.mesh
     unwrapped = subject.unwrapped

@@ -49,7 +49,8 @@ class Binary:
         """Add values [N] or [N, C], float32, uint32 or normalized uint8, and return the index of their accessor.
 
         Args:
-            values: the array. target: target of the buffer view.
+            values: the array.
+            target: target of the buffer view.
             bounds: record the minimum and the maximum, which positions require.
         """
         table = values.reshape(len(values), -1)
@@ -71,8 +72,9 @@ class Binary:
         """Write a file with one primitive.
 
         Args:
-            path: the file. asset: glTF asset record without the version. primitive: primitive of the only
-                mesh.
+            path: the file.
+            asset: glTF asset record without the version.
+            primitive: primitive of the only mesh.
             more: additional fields of the tree.
 
         Raises:
@@ -108,9 +110,13 @@ class Textured:
     """Mesh with textures, in the axes and units of the file.
 
     Attributes:
-        vertices, normals: [V, 3]. uv: [V, 2], with v down from the first row. faces: [F, 3].
-        base_color: [T, T, 3] sRGB. surface: [T, T, 3] roughness in green, metalness in blue; None for unlit.
-        specular: [T, T] factor on a dielectric's reflection; None for 1. index: refractive index.
+        vertices, normals: [V, 3].
+        uv: [V, 2], with v down from the first row.
+        faces: [F, 3].
+        base_color: [T, T, 3] sRGB.
+        surface: [T, T, 3] roughness in green, metalness in blue; None for unlit.
+        specular: [T, T] factor on a dielectric's reflection; None for 1.
+        index: refractive index.
         added: [T, T, 3] textures of added surface properties, only for GLB files.
     """
 
@@ -147,7 +153,9 @@ def write_glb(path: Path, model: Textured, asset: dict[str, Any], *, jpeg: bool)
     """Write a textured mesh.
 
     Args:
-        path: the file. model: the mesh. asset: glTF asset record without the version.
+        path: the file.
+        model: the mesh.
+        asset: glTF asset record without the version.
         jpeg: encode base color, roughness and metalness as JPEG instead of PNG.
 
     Raises:
@@ -204,8 +212,10 @@ def write_obj(folder: Path, model: Textured, lines: Sequence[str], *, jpeg: bool
     """Write ``model.obj``, ``model.mtl`` and the textures ``model-color``, ``model-roughness`` and ``model-metalness``.
 
     Args:
-        folder: folder to write. model: the mesh. lines: comments. jpeg: encode the color as JPEG instead of
-            PNG.
+        folder: folder to write.
+        model: the mesh.
+        lines: comments.
+        jpeg: encode the color as JPEG instead of PNG.
 
     Raises:
         PolarguideError: a file cannot be written.

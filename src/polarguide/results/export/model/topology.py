@@ -243,7 +243,9 @@ def write_stl(path: Path, vertices: Places, faces: NDArray[np.int64], comment: s
     """Write a binary STL file.
 
     Args:
-        path: the file. vertices: [V, 3] in the axes of the file. faces: [F, 3].
+        path: the file.
+        vertices: [V, 3] in the axes of the file.
+        faces: [F, 3].
         comment: text for the header, of which 80 characters are kept. It must not begin with "solid".
 
     Raises:

@@ -33,8 +33,10 @@ class Unwrapped:
     """Mesh whose vertices are split along the borders of charts.
 
     Attributes:
-        source: [W] original vertex of each vertex. faces: [F, 3] of the new vertices.
-        uv: [W, 2] in [0, 1], with v from the first row of the texture. charts: number of charts.
+        source: [W] original vertex of each vertex.
+        faces: [F, 3] of the new vertices.
+        uv: [W, 2] in [0, 1], with v from the first row of the texture.
+        charts: number of charts.
     """
 
     source: NDArray[np.int64]
@@ -49,8 +51,11 @@ def unwrap(
     """Cut a mesh into charts and pack them into a square texture.
 
     Args:
-        vertices: [V, 3]. faces: [F, 3]. texture: texels along its side.
-        folder: folder for exchanged files. reporter: receives progress, and a warning about many triangles.
+        vertices: [V, 3].
+        faces: [F, 3].
+        texture: texels along its side.
+        folder: folder for exchanged files.
+        reporter: receives progress, and a warning about many triangles.
 
     Raises:
         PolarguideError: xatlas fails, for example because of insufficient memory.
@@ -107,8 +112,10 @@ class Texels:
     """The M texels of a square texture whose centers lie on a triangle.
 
     Attributes:
-        size: texels along the texture's side. index: [M] row times ``size`` plus column.
-        face: [M] triangle of each texel. weights: [M, 3] barycentric coordinates, single precision.
+        size: texels along the texture's side.
+        index: [M] row times ``size`` plus column.
+        face: [M] triangle of each texel.
+        weights: [M, 3] barycentric coordinates, single precision.
     """
 
     size: int
