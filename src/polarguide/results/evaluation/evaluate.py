@@ -452,7 +452,7 @@ def _score(
 
 
 def _peak_memory(before: float | None) -> dict[str, Any]:
-    """Return the record of the peak memory in MiB; empty unless scoring exceeded the peak ``before``."""
+    """Return the peak memory of this process in MiB if scoring exceeded the peak ``before``, else the reason for None."""
     peak = peak_memory_mib()
     if peak is None or before is None:
         return {"peak_memory_mib": None, "peak_memory_mib_reason": "the operating system does not report it"}

@@ -183,7 +183,7 @@ def _sampled(surface: Surface, used: NDArray[np.bool_], spacing: float) -> tuple
 
 
 def _centers(n: int) -> Points:
-    """Divide a triangle into n * n equal triangles, and return the barycentric coordinates of their centers, [n * n, 3]."""
+    """Return the barycentric coordinates [n * n, 3] of the centers of n * n equal parts of a triangle."""
     first, second = np.meshgrid(np.arange(n), np.arange(n), indexing="ij")
     upright = first + second < n
     turned = first + second < n - 1

@@ -294,7 +294,7 @@ class ViewTarget:
 
     @property
     def unseen(self) -> Tensor:
-        """Mask [H, W] of valid pixels whose content is visible in no training view; all False if this was not determined."""
+        """Mask [H, W] of valid pixels that are visible in no training view; all False if this was not determined."""
         return self.valid.mask & ~(self.valid if self.seen is None else self.seen).mask
 
     def with_coverage(self, seen: Tensor) -> ViewTarget:

@@ -390,7 +390,7 @@ class Presented:
         return comments(self.origin, self.placement)
 
     def surface_view(self, run: OpenedRun) -> Callable[[Camera], RenderResult]:
-        """Return a function that renders the Gaussians of the subject, with the surface at the median depth of each pixel."""
+        """Return a function that renders the subject's Gaussians, with the surface at each pixel's median depth."""
         model = run.model
 
         @torch.no_grad()

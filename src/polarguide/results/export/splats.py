@@ -201,7 +201,7 @@ def _harmonics(rest: Tensor, width: int, pictures: dict[str, Pixels]) -> dict[st
 
 
 def _clusters(points: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """Cluster points [N, D] with Lloyd's algorithm; return the index [N] of each point's cluster and the means of clusters."""
+    """Cluster points [N, D] with Lloyd's algorithm. Return each point's cluster index [N] and the cluster means."""
     generator = torch.Generator().manual_seed(SEED)
     means = points[torch.randperm(len(points), generator=generator)[:count]].clone()
     for _ in range(ROUNDS):
@@ -218,7 +218,7 @@ def _nearest(points: Tensor, means: Tensor) -> Tensor:
 
 
 def _morton_order(means: Tensor) -> Tensor:
-    """Return the indices that sort points in Morton order, so that neighbors in space are stored together and compress well."""
+    """Return the indices that sort points in Morton order. Neighbors in space then lie together and compress well."""
     # Ranks instead of positions: distant Gaussians would compress all others into one cell.
     ranks = means.argsort(dim=0).argsort(dim=0)
     return curve_places((ranks * 1024) // max(1, len(means))).argsort(stable=True)
