@@ -53,8 +53,7 @@ class Run(OpenedRun):
     write_pictures = pictures.write_pictures
 
     def metrics(self) -> Mapping[str, Any]:
-        """Return the scores that ``evaluate`` wrote: means over the test views, and the scores of each view in
-        ``views``.
+        """Return the scores that ``evaluate`` wrote: means over the test views, and scores by view in ``views``.
 
         Raises:
             PolarguideError: the run has no scores, or the file of scores is invalid.

@@ -96,7 +96,7 @@ def _plain(name: str) -> str:
 
 
 def _pip(*packages: str) -> str:
-    """Return a command line that runs pip with this Python. The pip in the shell's path may belong to another Python."""
+    """Return a command line that runs the pip of this Python, because the shell's pip may belong to another Python."""
     executable = shutil.which("pip")
     ours = executable is not None and Path(executable).parent == Path(sys.executable).parent
     return shlex.join([*(["pip"] if ours else [sys.executable, "-m", "pip"]), "install", *packages])

@@ -172,7 +172,7 @@ Memory = Annotated[
 
 
 def index_of(specified: float | None, scene: float | None = None) -> float:
-    """Return the refractive index from the options, from ``scene.json``, or from ``INDEX``, in this order of priority."""
+    """Return the specified refractive index, the index in ``scene.json``, or ``INDEX``: the first that exists."""
     return next((index for index in (specified, scene) if index is not None), INDEX)
 
 

@@ -211,7 +211,7 @@ class MemoryBound:
             self._waits = SETTLED
 
     def clear(self) -> None:
-        """Return freed memory to the system above half of the limit. Call it between operations with different sizes."""
+        """Return freed memory to the system above half of the limit. Call it between operations of different sizes."""
         if resident_memory() > PARTLY * self._limit:
             return_freed_memory()
 
@@ -262,8 +262,8 @@ def network_address() -> str | None:
 def free_memory(group: Path = Path("/sys/fs/cgroup")) -> int:
     """Return the number of bytes that this process may still allocate.
 
-    The limit is the free memory of the system or of the process's control group. Cached files of a control group count
-    as free, because the system drops them on demand.
+    It is the free memory of the system or of the process's control group, whichever is smaller. Cached files of a
+    control group count as free, because the system drops them on demand.
     """
     available = int(psutil.virtual_memory().available)
     with contextlib.suppress(OSError, ValueError):

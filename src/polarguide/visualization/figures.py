@@ -157,7 +157,7 @@ NOTHING: Mapping[str, str] = MappingProxyType({})
 
 
 def radiance_to_rgb(linear: Tensor) -> Picture:
-    """Convert linear radiance [H, W, 3] to a displayed picture: clip to [0, 1] and encode as sRGB. NaN becomes black."""
+    """Clip linear radiance [H, W, 3] to [0, 1] and encode it as an sRGB picture. NaN becomes black."""
     return _to_uint8(shown(linear.detach().nan_to_num(nan=0.0)))
 
 
@@ -302,7 +302,7 @@ def normal_ball(high: int = 64, width: int = 256) -> Picture:
 
 
 def shares_to_rgb(shares: Tensor) -> Picture:
-    """Convert values [H, W, 3] in [0, 1] to red, green and blue without sRGB encoding. Invalid values become mid gray."""
+    """Convert values [H, W, 3] in [0, 1] to RGB without sRGB encoding. Values that are not finite become mid gray."""
     return _to_uint8(shares.detach().nan_to_num(0.5, 0.5, 0.5))
 
 
@@ -483,7 +483,7 @@ def layer_scale(name: str, depths: Depths | None = None) -> Picture | None:
 
 
 def clipping_exposure(values: Tensor) -> float:
-    """Return the largest factor, at most 1, by which radiance [H, W, 3] can be multiplied so that under 1 % of it clips."""
+    """Return the largest factor, at most 1, with which under 1 % of the pixels of radiance [H, W, 3] exceed 1."""
     brightest = values.detach().nan_to_num(0.0, 0.0, 0.0).amax(dim=-1).flatten().sort().values
     limit = float(brightest[max(0, brightest.numel() - 1 - brightest.numel() // 128)])
     return min(1.0, 1.0 / limit) if limit > 0 else 1.0

@@ -24,7 +24,7 @@ BASE = "polarguide.visualization"
 
 @lru_cache
 def templates(package: str) -> Environment:
-    """Load the templates in the folder ``page`` of a package, and the common ones. Values in HTML and SVG are escaped."""
+    """Load the common templates and those in a package's folder ``page``. Values in HTML and SVG are escaped."""
     environment = Environment(
         loader=ChoiceLoader([PackageLoader(package, "page"), PackageLoader(BASE, "page")]),
         autoescape=select_autoescape(["html", "svg"]),
