@@ -175,7 +175,8 @@ def _fault(value: Any, kind: Any, path: str = "") -> tuple[str, str, str]:
     """Find the part of a value that does not fit a type.
 
     Returns:
-        The path of the part in the value, the expected type, and the part itself, as texts for a message."""
+        The path of the part in the value, the expected type, and the part itself, as texts for a message.
+    """
     for step, part, part_kind in _parts(value, kind):
         try:
             _convert(part, part_kind)

@@ -62,7 +62,8 @@ def letterboxed(photograph: Picture, frame_size: tuple[int, int]) -> Picture:
 def drawn_camera(camera: Camera, view: View | None) -> Camera:
     """Return the camera with which a window's picture is rendered.
 
-    It is the free camera or, if ``view`` is set, the pose of this view with the size of the window."""
+    It is the free camera or, if ``view`` is set, the pose of this view with the size of the window.
+    """
     if view is None:
         return camera
     return view.camera.extended(camera.width, camera.height)
@@ -143,7 +144,8 @@ def keyframe(camera: Camera, frame_size: tuple[int, int]) -> Camera:
 def keyframe_path(keyframes: list[Camera], seconds: float) -> list[Camera]:
     """Return a smooth camera path that takes ``seconds`` from one keyframe to the next.
 
-    Fewer than two keyframes are returned unchanged."""
+    Fewer than two keyframes are returned unchanged.
+    """
     if len(keyframes) < 2:
         return keyframes
     return interpolated(keyframes, 1 + round((len(keyframes) - 1) * seconds * FRAMES_PER_SECOND))

@@ -253,7 +253,7 @@ HEADERS = {
     "Referrer-Policy": "no-referrer",
 }
 Check = Callable[[bytes | str], bytes | None]
-"""Function that checks a message. It returns a valid message or, for a message to ignore, None. It may raise ``Refused``."""
+"""Function that returns a valid message, returns None for a message to ignore, or raises ``Refused``."""
 
 _WRAPPING = threading.Lock()
 _QUIET = logging.getLogger("polarguide.viewer.connections")  # broken requests of strangers are not logged

@@ -126,7 +126,7 @@ class Materials:
         return int(which.sum())
 
     def _painted(self, camera: Camera, place: Sequence[float], size: float) -> tuple[Tensor, Tensor]:
-        """Return two counts [N] of the pixels that each Gaussian fills: in a disc of a picture, and in the whole picture."""
+        """Return how many pixels each Gaussian fills, [N], in a disc of a picture and in the whole picture."""
         scale = min(1.0, LOOKED_AT / camera.height)
         small = camera.scaled(
             scale, max(1, round(scale * camera.width)), max(1, round(scale * camera.height))
@@ -170,7 +170,8 @@ class Materials:
 def _averaged(axes: Tensor, colors: Tensor, weights: Tensor, near: Tensor) -> tuple[Tensor, Tensor]:
     """Average axes [N, 3] and colors [N, 3] over the neighbors [N, K] of each Gaussian, with weights [N].
 
-    The averaged axes are normalized. Their sign is arbitrary."""
+    The averaged axes are normalized. Their sign is arbitrary.
+    """
     parts = []
     for some in near.split(CHUNK):
         counts = weights[some][..., None]

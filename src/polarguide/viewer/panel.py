@@ -258,7 +258,7 @@ class Panel:
             self._status.content = text
 
     def crop(self, up_axis: Vector | None = None) -> Crop | None:
-        """Return the crop box, or None without cropping. If ``up_axis`` is None, the box has the up axis of the cameras."""
+        """Return the crop box, or None without cropping. If ``up_axis`` is None, the cameras' up axis is used."""
         if not self["crop"].value:
             return None
         if self._saved_crop is not None:
@@ -425,7 +425,7 @@ class Presenting:
         self._panel.show_note(ASKS[what])
 
     def _listen(self, what: str) -> None:
-        """Start to receive clicks for a quantity, or stop if they are already received."""
+        """Start to receive clicks for the quantity ``what``. An empty text stops it."""
         self._picking = what
         self._clicks.want(bool(what))
 

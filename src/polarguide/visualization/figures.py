@@ -466,7 +466,8 @@ def depth_picture(depth: Tensor, depths: Depths) -> Picture:
 def layer_scale(name: str, depths: Depths | None = None) -> Picture | None:
     """Return the legend of a layer, 256 pixels wide.
 
-    Return None for radiance, which needs no legend, and for depth if ``depths`` is None."""
+    Return None for radiance, which needs no legend, and for depth if ``depths`` is None.
+    """
     name = name.partition(",")[0]
     if name in _SHARES:
         return scale_bar(0.0, 1.0, "viridis")
@@ -496,7 +497,8 @@ _SAMPLES = 1_000_000
 def depth_range(depth: Tensor, mask: Tensor) -> Depths:
     """Return the range of the masked depths without the nearest 2 % and the farthest 2 %.
 
-    ``depth`` and ``mask`` have the same shape."""
+    ``depth`` and ``mask`` have the same shape.
+    """
     values = depth[mask & (depth > 0)]
     if values.numel() == 0:
         return 1.0, 2.0

@@ -454,7 +454,8 @@ def _score(
 def _peak_memory(before: float | None) -> dict[str, Any]:
     """Return the peak memory of this process in MiB, or the reason why it is unknown.
 
-    The peak belongs to the scoring only if it exceeds ``before``, the peak before the scoring."""
+    The peak belongs to the scoring only if it exceeds ``before``, the peak before the scoring.
+    """
     peak = peak_memory_mib()
     if peak is None or before is None:
         return {"peak_memory_mib": None, "peak_memory_mib_reason": "the operating system does not report it"}

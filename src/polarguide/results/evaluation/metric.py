@@ -131,7 +131,8 @@ def _loaded(entry: EntryPoint) -> tuple[Metric, ...]:
 class _Guarded:
     """Wrapper of a measure from another package, which must not stop the scoring.
 
-    If the measure fails, the metric has no value. The first failure causes a warning."""
+    If the measure fails, the metric has no value. The first failure causes a warning.
+    """
 
     def __init__(self, entry: EntryPoint, measure: Measure) -> None:
         self._entry = entry

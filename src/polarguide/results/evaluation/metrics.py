@@ -301,7 +301,8 @@ def mean_alpha(alpha: Tensor, keep: Selection) -> Tensor:
 def _median(values: Tensor) -> Tensor:
     """Compute the median of values [P]; NaN for an empty tensor.
 
-    The median of an even number of values is the mean of the middle two."""
+    The median of an even number of values is the mean of the middle two.
+    """
     count = len(values)
     if count == 0:
         return values.new_full((), torch.nan)

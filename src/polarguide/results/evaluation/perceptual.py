@@ -104,7 +104,8 @@ def load_lpips() -> tuple[Lpips | None, str | None]:
     """Load LPIPS once per process and location of its files.
 
     Returns:
-        (distance, None), or (None, reason) if the weights cannot be loaded."""
+        (distance, None), or (None, reason) if the weights cannot be loaded.
+    """
     files = []
     for name in (NETWORK, CHANNELS):
         file = next((path for path in places(name) if path.is_file()), None)
@@ -203,7 +204,8 @@ def load_package() -> tuple[Any, str | None]:
     """Load the package ``flip_evaluator`` once per process.
 
     Returns:
-        (package, None), or (None, reason) if the package cannot be loaded."""
+        (package, None), or (None, reason) if the package cannot be loaded.
+    """
     try:
         return optional_import("flip_evaluator", "FLIP"), None
     except PolarguideError:

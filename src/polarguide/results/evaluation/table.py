@@ -309,7 +309,8 @@ def _worst_view(record: Mapping[str, Any], metric: Metric) -> list[tuple[str, st
 def absent_metrics(record: Mapping[str, Any]) -> list[str]:
     """Return the labels of metrics without a value for which no reason is recorded.
 
-    Either the ground truth or the layer is missing."""
+    Either the ground truth or the layer is missing.
+    """
     return [
         metric.label
         for metric in METRICS

@@ -88,7 +88,8 @@ class SceneFacts:
 def foreground(view: View) -> Tensor | None:
     """Return the foreground mask [H, W] of a view.
 
-    The mask of the ground truth has priority over the mask of the user. Return None if there is no mask."""
+    The mask of the ground truth has priority over the mask of the user. Return None if there is no mask.
+    """
     truth = view.ground_truth
     return truth.mask if truth is not None and truth.mask is not None else view.mask
 

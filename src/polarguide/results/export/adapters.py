@@ -94,7 +94,8 @@ def _(shading: DirectionalShading, gaussians: Parameters) -> dict[str, Tensor]:
 def page_shading(shading: ShadingModel, gaussians: Parameters, light: Light) -> PageShading | None:
     """Return the data with which a page shades Gaussians.
 
-    Return None if the page has no shaders for the model. Then the colors are baked into the Gaussians."""
+    Return None if the page has no shaders for the model. Then the colors are baked into the Gaussians.
+    """
     return None
 
 

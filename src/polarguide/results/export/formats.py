@@ -388,7 +388,8 @@ class _Exporter:
         """Write a package of files for other programs.
 
         It contains the model with and without shading, splats, an environment map, a preview, and the record
-        ``model.json``."""
+        ``model.json``.
+        """
         run = self.run
         lit = replace(self.options, unlit=False)
         radiant = run.model.shading.radiance_cubemap is not None

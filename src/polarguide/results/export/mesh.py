@@ -77,7 +77,8 @@ def write_mesh(
 def asset_record(placement: Placement, origin: Origin) -> dict[str, Any]:
     """Return the asset record of a glTF file.
 
-    The unit of glTF is the meter. If the scale of the scene is unknown, the field ``units`` states this."""
+    The unit of glTF is the meter. If the scale of the scene is unknown, the field ``units`` states this.
+    """
     units = "meters" if placement.metric else "units of the scene; their length is unknown"
     credit = origin.presentation.credit
     return {

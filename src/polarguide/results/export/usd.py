@@ -153,7 +153,8 @@ def _module(name: str) -> Any:
 def _package(path: Path, about: dict[str, Any], fill: Callable[[Any, Path], None]) -> None:
     """Write a USD stage as a package.
 
-    The function ``fill`` adds content to the stage. It may write textures into the folder that it receives."""
+    The function ``fill`` adds content to the stage. It may write textures into the folder that it receives.
+    """
     usd, geom, utils, sdf = (_module(name) for name in ("Usd", "UsdGeom", "UsdUtils", "Sdf"))
     with temporary_folder(path.with_suffix(".parts")) as folder:
         stage = usd.Stage.CreateNew(str(folder / "model.usdc"))

@@ -144,7 +144,8 @@ def _quantized(values: Tensor, kind: np.dtype[Any]) -> NDArray[Any]:
 def planes(data: NDArray[Any]) -> bytes:
     """Transpose records to byte planes: the first byte of each record, then the second byte of each record, and so on.
 
-    Neighboring records are similar, so byte planes compress well."""
+    Neighboring records are similar, so byte planes compress well.
+    """
     return np.ascontiguousarray(data.view(np.uint8).reshape(len(data), data.itemsize).T).tobytes()
 
 
@@ -160,7 +161,8 @@ def harmonics_steps(rest: Tensor) -> tuple[NDArray[np.int8], NDArray[np.float16]
 def _axes(gaussians: Parameters, mask: Tensor) -> tuple[Tensor, Tensor]:
     """Return the normal axes [K, 3] and their sides [K].
 
-    The side is 1 if the axis points outward. It is 0 if the position of the camera determines the direction."""
+    The side is 1 if the axis points outward. It is 0 if the position of the camera determines the direction.
+    """
     means = gaussians["means"][mask]
     origin = torch.zeros(3)
     axes = shortest_axis_normals(means, gaussians["quaternions"][mask], gaussians["log_scales"][mask], origin)
@@ -449,7 +451,8 @@ def share(
 def _best_view(views: Sequence[View], record: Mapping[str, Any] | None, health: Health | None) -> View:
     """Return the view with the highest PSNR in the scores or in the health check of the training.
 
-    Return the first view if there is no PSNR."""
+    Return the first view if there is no PSNR.
+    """
     psnr: dict[str, float | None] = {}
     if record is not None:
         psnr = {name: scores["psnr"] for name, scores in record["views"].items()}

@@ -284,7 +284,8 @@ def _depth_samples(result: RenderResult, camera: Camera) -> DepthSamples:
 def painted(surface: Surface, views: list[tuple[Camera, DepthSamples]], box: Box) -> ColoredMesh:
     """Color a surface by the mean color and normal of each vertex over the views that see it.
 
-    The weight of a view is the cosine of its viewing angle."""
+    The weight of a view is the cosine of its viewing angle.
+    """
     vertices = torch.from_numpy(surface.vertices)
     own = torch.from_numpy(surface.normals)
     color = torch.zeros_like(vertices)

@@ -43,7 +43,8 @@ class Subject:
     def report_removed(self, inside: Tensor, run: OpenedRun, reporter: Reporter) -> None:
         """Report how many Gaussians belong to the part, and the commands that change the part.
 
-        Without Gaussians outside the part, report no message."""
+        Without Gaussians outside the part, report no message.
+        """
         count = int(inside.sum())
         if count < len(inside):
             reporter.say(

@@ -186,7 +186,8 @@ def _visible(
 
     Returns:
         The rows [K] of the visible points in ``points``, their weights [K], and their positions [K, 2] in the picture,
-        in [-1, 1] as for ``grid_sample``."""
+        in [-1, 1] as for ``grid_sample``.
+    """
     offsets = points - camera.center.float()
     cosine = -dot(unit(offsets), normals)
     rows = (cosine > STEEPEST).nonzero()[:, 0]
@@ -212,7 +213,8 @@ def _visible(
 def _nearest_seen(places: NDArray[np.float32], visible: NDArray[np.bool_]) -> NDArray[np.int64]:
     """Return the index of an approximately nearest visible texel for each invisible texel.
 
-    Without visible texels, return the index of each texel itself."""
+    Without visible texels, return the index of each texel itself.
+    """
     known = visible.nonzero()[0]
     unseen = (~visible).nonzero()[0]
     if not len(known) or not len(unseen):

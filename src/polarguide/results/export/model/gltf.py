@@ -144,7 +144,8 @@ def linear_pixels(values: NDArray[np.float32]) -> Pixels:
 def encoded(pixels: Pixels, *, jpeg: bool) -> tuple[str, bytes]:
     """Encode a picture [H, W, 3 or 4], and return its media type and the bytes of the file.
 
-    A picture with transparency is encoded as PNG even if ``jpeg`` is set."""
+    A picture with transparency is encoded as PNG even if ``jpeg`` is set.
+    """
     kind = "jpeg" if jpeg else "png"
     file = io.BytesIO()
     Image.fromarray(pixels).save(file, kind, quality=QUALITY)

@@ -128,7 +128,8 @@ class _Rays:
     def arriving(self, origins: Places, directions: Places, radiance: Radiance) -> Places:
         """Return the radiance [N, 3] that arrives at each origin from a unit direction [N, 3].
 
-        It comes from the mesh if the ray hits it, otherwise from the environment."""
+        It comes from the mesh if the ray hits it, otherwise from the environment.
+        """
         starts, rays = (np.ascontiguousarray(values, np.float32) for values in (origins, directions))
         hits = self._scene.run(starts, rays, output=True)
         light = radiance(directions)

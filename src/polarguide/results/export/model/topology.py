@@ -160,7 +160,8 @@ def consistent(vertices: Places, faces: Faces) -> Faces:
 def _closed(vertices: Places, faces: Faces, largest: float) -> tuple[Places, Faces]:
     """Close holes with a fan of triangles around their center.
 
-    ``largest`` is the largest perimeter of a hole to close, relative to the diagonal of the mesh."""
+    ``largest`` is the largest perimeter of a hole to close, relative to the diagonal of the mesh.
+    """
     directed = _directed(faces)
     edges = directed[~np.isin(_keys(directed), _keys(directed[:, ::-1]))]
     limit = largest * float(np.linalg.norm(np.ptp(vertices, axis=0)))

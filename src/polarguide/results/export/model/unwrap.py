@@ -90,7 +90,8 @@ def unwrap(
 def run_xatlas() -> None:
     """Unwrap a mesh in a separate process.
 
-    The command line names the file of the mesh and the file to which the atlas is written."""
+    The command line names the file of the mesh and the file to which the atlas is written.
+    """
     xatlas = optional_import("xatlas", "a textured model")
     task, answer = sys.argv[1:3]
     with np.load(task) as mesh:
