@@ -54,7 +54,7 @@ def firm_to_the_end(base: Recipe) -> Recipe:
 
 
 def release_rates(**others: float) -> Change:
-    """Return a change to the geometry's learning rates in the 3DGS release. ``others`` adds rates of other parameters."""
+    """Return a change to the geometry's learning rates in the 3DGS release. ``others`` adds other parameters."""
     slow = {"means": 1.6e-4, "log_scales": 5e-3, **others}
     return lambda recipe: replace(recipe, rates={**recipe.rates, **slow}, means_decay=0.01)
 

@@ -415,7 +415,7 @@ def _health(runs: Sequence[PlannedRun]) -> list[str]:
 def _scene_views(
     comparison: Comparison, entry: SceneEntry, runs: Sequence[PlannedRun], names: Sequence[str], limit: int
 ) -> Iterator[tuple[EmbeddedView | None, str | None]]:
-    """Yield the result of ``embed`` for each named view of a scene. ``limit`` is the size limit of one view in bytes."""
+    """Yield the result of ``embed`` for each named view of a scene. ``limit`` is the limit of each view in bytes."""
     scene = read_scene(entry.path, comparison.options)
     device = comparison.options.device if comparison.options.local else "auto"
     opened = [open_compared(run.folder, device) for run in runs]

@@ -317,8 +317,8 @@ def shared(values: Numbers) -> Numbers:
         values: [recipes, seeds, units].
 
     Returns:
-        [recipes, seeds, shared units]. The values are NaN at seeds that a recipe lacks. Without a shared seed, there
-        are no shared units.
+        [recipes, seeds, shared units]. The values are NaN at a unit and seed that a recipe lacks. Without a shared
+        seed, there are no shared units.
     """
     present = ~np.asarray(np.isnan(values).any(axis=0))
     seeds = present.any(axis=1)
@@ -327,7 +327,7 @@ def shared(values: Numbers) -> Numbers:
 
 
 def paired(of: Numbers, other: Numbers) -> Numbers:
-    """Return differences ``of - other`` [seeds, units] at the seeds and units that both recipes have; see ``shared``."""
+    """Return differences ``of - other`` [seeds, units] at the seeds and units that both recipes have (``shared``)."""
     return np.asarray(np.subtract(*shared(np.stack([of, other]))))
 
 
