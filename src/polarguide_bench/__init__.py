@@ -1,1 +1,1 @@
-"""Comparisons of recipes, their tables and reports; collections of captures; ablations; and GNeRP, a baseline."""
+"""Comparisons of recipes with tables and reports, batch processing of captures, ablations, and the baseline GNeRP."""

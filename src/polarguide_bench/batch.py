@@ -47,7 +47,7 @@ from polarguide_bench.tables import csv_text, formatted
 
 @dataclass(frozen=True)
 class CaptureRow:
-    """A capture on the overview page.
+    """Row of the overview page, which describes one capture.
 
     Attributes:
         name: name of the capture.
@@ -55,7 +55,7 @@ class CaptureRow:
         folder: folder of its results.
         state: "done", "failed" or "waiting".
         error: reason of a failure, in one line.
-        record: progress and results.
+        record: progress and results of the capture.
     """
 
     name: str
@@ -81,7 +81,7 @@ class CaptureRow:
         return (*self.record.findings, *evidence, *warnings)
 
     def links(self) -> list[tuple[str, str]]:
-        """Return label and path of each existing result, relative to the page."""
+        """Return the label of each existing result, and its path relative to the page."""
         results = {
             "inspect": ("inspection", f"{INSPECTION}/{INSPECTION_PAGE}"),
             "eval": ("where the errors are", f"{RUN}/errors.png"),
@@ -94,7 +94,7 @@ class CaptureRow:
 
 
 def write_page(out: Path, rows: Sequence[CaptureRow]) -> None:
-    """Write ``index.html`` and ``results.csv`` atomically. The page links to files in the captures' folders."""
+    """Write ``index.html`` and ``results.csv`` atomically. The page links to files in the folders of the captures."""
     scores = {row.name: row.scores() for row in rows}
     columns = [
         column
@@ -132,7 +132,7 @@ def write_page(out: Path, rows: Sequence[CaptureRow]) -> None:
 
 
 CAPTURES = "captures"
-"""Folder of the captures' folders."""
+"""Name of the folder that contains the folders of all captures."""
 WORK_BYTES = 2_000_000_000
 """Memory request of a job of SLURM or PBS. The size of a capture is unknown before its preparation."""
 
@@ -153,14 +153,14 @@ def run_batch(
     Args:
         captures: captures with unique names.
         out: output folder.
-        options: place of the computation, and formats of the export.
+        options: options of the computation, and formats of the export.
         reporter: receives messages and progress.
 
     Returns:
         The rows of the page.
 
     Raises:
-        PolarguideError: no captures, an unknown recipe, or another batch is writing to ``out``.
+        PolarguideError: there are no captures, a recipe is unknown, or another batch is writing to ``out``.
     """
     require(captures, "batch", expected="a capture", found="no capture", remedy="Name at least one.")
     for capture in captures:
@@ -221,7 +221,7 @@ def _task(capture: Capture, root: Path, options: BatchOptions) -> Processing:
 
 
 def _job(task: Processing) -> Job:
-    """Return the job that processes a capture. Its steps differ in length, so it counts as one unit of work."""
+    """Return the job that processes a capture. It counts as one unit of work, because its steps differ in length."""
     folder = Path(task.folder)
 
     def progress() -> tuple[int, str]:
@@ -242,7 +242,7 @@ def _job(task: Processing) -> Job:
 
 
 def _row(task: Processing, failures: dict[str, str]) -> CaptureRow:
-    """Return the row of a capture according to its folder."""
+    """Return the row of a capture from the files in its folder."""
     folder = Path(task.folder)
     error = failures.get(task.name, "")
     record = CaptureRecord(FORMAT, task.request)

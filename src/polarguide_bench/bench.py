@@ -1,4 +1,4 @@
-"""``polarguide bench``: render the missing scenes of the bench, and compare its rows on them."""
+"""The verb ``polarguide bench``, which renders the scenes of the bench and compares recipes on them."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ def run_bench(
     bench: Bench = BENCH,
     reporter: Reporter = SILENT,
 ) -> Results | None:
-    """Render the missing scenes of a half of the bench, then compare the rows on them.
+    """Render the missing scenes of one half of the bench, and compare recipes on all scenes of this half.
 
     Scenes are written to ``scenes/NAME`` of ``out``, and the comparison to its ``development`` or ``held-back``.
     Finished work is verified and not repeated. After a KeyboardInterrupt the same call resumes.
 
     Args:
         out: output folder.
-        options: half, scenes, and place of the computation.
+        options: half of the bench, selected scenes, and options of the computation.
         bench: scenes, rows and settings.
         reporter: receives messages and progress, and the SHA-256 of each scene.
 
@@ -45,9 +45,9 @@ def run_bench(
         The results of the comparison, or None with ``render_only``.
 
     Raises:
-        PolarguideError: a scene in ``out`` has other settings or another version of its preset, or a changed file;
-            Mitsuba is missing and a scene is not rendered; see ``compare``. All scenes are checked before any file is
-            written.
+        PolarguideError: a scene in ``out`` was rendered with other settings or another version of its preset, or one of
+            its files has changed. A scene is not rendered and Mitsuba is missing. The comparison fails, see
+            ``compare``. All scenes are checked before any file is written.
     """
     specs = {name: Overrides(views=bench.views).apply(find_scene(name)) for name in options.chosen(bench)}
     refuse_scene(Path(out))
@@ -86,10 +86,10 @@ def run_bench(
 
 
 def _state(place: Path, spec: SceneSpec, bench: Bench) -> State:
-    """Return the state of a scene's rendering. A finished scene is verified with its checksums.
+    """Return the state of a scene's rendering. The files of a finished scene are verified by their checksums.
 
     Raises:
-        PolarguideError: the folder contains other files, or the scene differs from that of the bench.
+        PolarguideError: the folder contains unknown files, or its scene differs from the scene of the bench.
     """
     try:
         state = folder_state(place, scene_request(spec, bench.synth))

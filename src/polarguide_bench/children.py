@@ -1,7 +1,7 @@
-"""Tasks of comparisons and batches, and the child processes that perform them on workers of dask.
+"""Tasks of comparisons and batches, and child processes that perform the tasks on workers of dask.
 
-Workers and the command line import this module, so it does not import torch. A worker computes nothing itself. It
-therefore always answers its scheduler, and each child has its own memory, threads and signals.
+Workers and the command line import this module, so it does not import torch. A worker does no computation itself, so it
+always answers its scheduler. Each child has its own memory, threads and signals.
 """
 
 from __future__ import annotations
@@ -30,30 +30,30 @@ from polarguide.preparation.settings import PrepareSettings
 from polarguide.training.settings import TrainSettings
 
 FORMAT = 1
-"""Version of the record of a capture."""
+"""Version of the format of a capture's record."""
 RECORD = "capture.json"
-"""File of the record in the folder of a capture."""
+"""Name of the record's file in the folder of a capture."""
 INSPECTION = "inspection"
-"""Folder of the inspection."""
+"""Name of the inspection's folder in the folder of a capture."""
 RUN = "run"
-"""Run folder."""
+"""Name of the run folder in the folder of a capture."""
 SHARE = "share.html"
-"""File of the shared page."""
+"""Name of the shared web page in the folder of a capture."""
 Step = Literal["prepare", "inspect", "train", "eval", "share", "export"]
 STEPS: tuple[Step, ...] = ("prepare", "inspect", "train", "eval", "share", "export")
-"""Steps of a capture in their order."""
+"""Processing steps of a capture, in order."""
 NO_FILES = (0, 0, 0)
 """Stamp of an empty or missing folder."""
 
 
 @dataclass(frozen=True)
 class Capture:
-    """A capture of a collection, and the options for it.
+    """Capture of a collection, with the options of its processing.
 
     Attributes:
-        name: name of its folder in the results.
-        path: folder of its files, or a scene.
-        prepare: settings of the preparation, unused for a scene.
+        name: name of the capture's folder in the results.
+        path: folder with the files of the capture, or a scene folder.
+        prepare: settings of the preparation, which a scene does not need.
         recipe: recipe of the training.
         settings: settings of the training.
         reading: options for reading the scene.
@@ -68,18 +68,18 @@ class Capture:
 
 
 class Request(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Inputs that determine the results of a capture.
+    """All inputs that determine the results of a capture. If they change, the results are outdated.
 
     Attributes:
         source: absolute path of the capture's folder.
         stamp: number, total size and newest modification time of its files.
-        prepare: ``PrepareSettings.record()``; None if the source is a scene.
+        prepare: result of ``PrepareSettings.record()``, or None if the source is a scene.
         recipe: recipe of the training.
         settings: settings of the training.
         reading: options for reading the scene.
         formats: formats of the export.
-        digest: SHA-256 of the names and contents of the files. It identifies unchanged files with a new stamp. Records
-            of earlier versions have an empty digest.
+        digest: SHA-256 of the names and contents of the files. It shows that files with a new stamp are unchanged.
+            Records of earlier versions have an empty digest.
     """
 
     source: str
@@ -98,11 +98,11 @@ class CaptureRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     Attributes:
         format: version of the record.
         request: inputs of the capture.
-        done: finished steps.
-        at: step that was started last.
+        done: steps that are finished.
+        at: last step that was started.
         verdict: verdict of the inspection.
-        findings: findings of the inspection that are not ok.
-        pictures: label and data URI of each picture of one view.
+        findings: findings of the inspection that describe a problem.
+        pictures: pictures of one view, each with a label and a data URI.
         files: exported files, relative to the capture's folder.
     """
 
@@ -121,7 +121,7 @@ class CaptureRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @staticmethod
     def load(folder: Path) -> CaptureRecord | None:
-        """Read the record of a folder; None if the folder has none.
+        """Read the record in a folder. Return None if the folder has no record.
 
         Raises:
             PolarguideError: the file is not a valid record.
@@ -131,7 +131,9 @@ class CaptureRecord(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return read_record(folder / RECORD, CaptureRecord, remedy="Remove the folder to begin again.")
 
     def require(self, request: Request, folder: Path) -> None:
-        """Check that the capture was started with the same request. A finished capture may lose its source.
+        """Check that the capture was started with the same request.
+
+        The source of a finished capture may be deleted.
 
         Raises:
             PolarguideError: the requests differ.
@@ -162,7 +164,7 @@ def prepare_settings(record: dict[str, Any]) -> PrepareSettings:
 
 
 def source_stamp(folder: Path) -> tuple[int, int, int]:
-    """Return the number, total size in bytes and newest modification time in ns of the files below a folder.
+    """Return the number of files below a folder, their total size in bytes, and the newest modification time in ns.
 
     Hidden files do not count.
     """
@@ -175,13 +177,13 @@ def source_stamp(folder: Path) -> tuple[int, int, int]:
 
 
 def source_digest(folder: Path, earlier: Request | None, stamp: tuple[int, int, int]) -> str:
-    """Return the SHA-256 of the names and contents of the files below a folder; empty without files.
+    """Return the SHA-256 of the names and contents of the files below a folder, or an empty text without files.
 
     Hidden files do not count.
 
     Args:
         folder: folder of the capture.
-        earlier: request of an earlier call. Its digest is reused if its stamp is the same.
+        earlier: request of an earlier call, if any. Its digest is reused if its stamp equals the current stamp.
         stamp: current stamp of the folder.
     """
     if earlier is not None and earlier.stamp == stamp and earlier.digest:
@@ -202,7 +204,7 @@ def _files_below(folder: Path) -> Iterator[str]:
 
 
 SOURCES = Path(__file__).parents[1]
-"""Folder of all packages."""
+"""Folder that contains all packages of this project."""
 PACKAGES = ("polarguide", "polarguide_shots", "polarguide_synth", "polarguide_bench")
 PROLOGUE = (
     "import gc, sys; gc.disable(); "  # imported names stay: a fifth of the time is saved
@@ -210,14 +212,14 @@ PROLOGUE = (
     "sys.path[:0] = [path for path in sys.argv[1:] if path not in sys.path]; "
     "from polarguide_bench.worker import main; gc.enable(); sys.exit(main())"
 )
-"""Program of a child. It imports this installation of the package, and nothing from the current folder."""
+"""Program that a child runs. It imports this installation of the package, but no module from the current folder."""
 COMMAND = (sys.executable, "-c", PROLOGUE, str(SOURCES))
 """Command line of a child."""
 
 
 @cache
 def files_digest() -> str:
-    """Return sixteen hexadecimal digits that identify the bytes of the code of all packages."""
+    """Return a digest of the source files of all packages, 16 hexadecimal digits."""
     digest = hashlib.sha256()
     kinds = ("**/*.py", "_native.*.so", "_native.*.pyd")
     for path in sorted(path for name in PACKAGES for kind in kinds for path in (SOURCES / name).glob(kind)):
@@ -227,7 +229,7 @@ def files_digest() -> str:
 
 
 class Training(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="train"):
-    """Task: train a run, or resume the run in its folder."""
+    """Task that trains a run, or resumes the run in its folder."""
 
     scene: str
     folder: str
@@ -238,7 +240,7 @@ class Training(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="tra
 
 
 class Scoring(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="score"):
-    """Task: score a finished run; with ``speed`` also measure its rendering speed."""
+    """Task that scores a finished run. With ``speed`` it also measures the rendering speed."""
 
     folder: str
     speed: bool
@@ -246,7 +248,7 @@ class Scoring(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="scor
 
 
 class Processing(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="process"):
-    """Task: take the remaining steps of a capture."""
+    """Task that performs the remaining steps of a capture."""
 
     name: str
     folder: str
@@ -258,12 +260,12 @@ Task = Training | Scoring | Processing
 
 
 class Message(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Line on the standard input of a child: a task, and digests of the sender's code.
+    """Message to a child: a task, and digests by which the child checks that it runs the same code.
 
     Attributes:
         task: the task.
         files: ``files_digest`` of the sender.
-        code: ``code_digest`` of the sender. It takes seconds to compute, and is compared only if ``files`` differs.
+        code: ``code_digest`` of the sender. Its computation takes seconds, so it is compared only if ``files`` differs.
     """
 
     task: Task
@@ -271,17 +273,16 @@ class Message(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     code: str
 
     def to_line(self) -> bytes:
-        """Return the message as one line of JSON. File names that are not valid Unicode become escapes."""
+        """Return the message as one line of JSON. File names that are not valid Unicode are escaped."""
         return json.dumps(msgspec.to_builtins(self)).encode() + b"\n"
 
 
 class Outcome(msgspec.Struct, frozen=True):
-    """Outcome of a job on a worker.
+    """Result of a job on a worker.
 
     Attributes:
-        state: "done", "failed", or "lost" if the child was stopped from outside. A lost job can resume on another
-            worker.
-        error: last line of ``stderr.txt``, or the exit status.
+        state: "done", "failed" or "lost". A job is lost if its child was killed. It can resume on another worker.
+        error: last line of ``stderr.txt``, or the exit status if this file is empty.
     """
 
     state: Literal["done", "failed", "lost"]
@@ -289,12 +290,12 @@ class Outcome(msgspec.Struct, frozen=True):
 
 
 POLL_SECONDS = 0.1
-"""Interval between checks of a child."""
+"""Interval between checks of a child, in seconds."""
 STDERR = "stderr.txt"
 STOPPED = 130
-"""Exit status of a child after a request to stop."""
+"""Exit status of a child that has stopped on request."""
 KILLED = tuple(-number for number in (signal.SIGTERM, getattr(signal, "SIGKILL", signal.SIGTERM)))
-"""Exit statuses of a child that was killed: by the system for lack of memory, by a user or by a cluster's manager."""
+"""Exit statuses of a killed child. The system kills it for lack of memory; users and cluster managers may, too."""
 
 _children: dict[str, subprocess.Popen[bytes]] = {}
 
@@ -305,12 +306,12 @@ def perform(
     *,
     gpus: Sequence[str] = (),
 ) -> Outcome:
-    """Perform tasks in turn on a worker of dask, until all are done or dask cancels the job.
+    """Perform tasks one after the other on a worker of dask, until all are done or dask cancels the job.
 
     Args:
-        messages: the tasks. Each has its own child process.
+        messages: messages with the tasks. Each task has its own child process.
         folder: folder for the ``stderr.txt`` of the children, created if missing.
-        gpus: GPUs of this machine. Its workers have the names 0, 1, ... and take the GPUs in turn.
+        gpus: GPUs of this machine. Workers are named 0, 1, ... and use the GPU at this index, modulo their number.
     """
     from distributed import get_worker
     from distributed.worker import thread_state
@@ -320,7 +321,7 @@ def perform(
     device = {"CUDA_VISIBLE_DEVICES": gpus[int(worker.name) % len(gpus)]} if gpus else {}
 
     def requested() -> bool:
-        """Return False if the job was canceled or its command has ended."""
+        """Return True unless the job was canceled or the command that submitted it has ended."""
         state = worker.state.tasks.get(key)
         return state is not None and state.state != "cancelled"
 

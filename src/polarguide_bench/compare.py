@@ -1,4 +1,4 @@
-"""Train and score several recipes on several scenes, or a recipe and its ablations, and write the results."""
+"""Comparison of several recipes, or of a recipe and its ablations, on several scenes."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ from polarguide_bench.results import (
 from polarguide_bench.tables import write_tables
 
 BESIDE_OTHERS = "beside_others.txt"
-"""File that marks a run whose training shared the machine, so that its time does not count."""
+"""Name of a file that marks a run whose training time does not count, because other jobs ran on the machine."""
 
 
 def compare(
@@ -78,11 +78,12 @@ def compare(
     command_line: str = "",
     reporter: Reporter = SILENT,
 ) -> Results:
-    """Train and score each recipe on each scene with each seed. Each run has its own processes.
+    """Train and score each recipe on each scene with each seed, each run in its own processes.
 
     Writes ``results.json``, ``.md``, ``.csv``, ``.tex`` and ``report.html`` to ``out``, and the runs to its ``runs/``.
-    Paired differences are written to ``differences.csv``, and scores by object and material to ``parts.csv``, if there
-    are any. With ``options.exposures``, ``exposures.svg`` shows the scores over the number of pictures.
+    If there are paired differences, they are written to ``differences.csv``. If there are scores by object and
+    material, they are written to ``parts.csv``. With ``options.exposures``, ``exposures.svg`` shows the scores over the
+    number of pictures.
 
     Finished runs are not repeated. After a KeyboardInterrupt active runs save their states, and the same call resumes.
 
@@ -93,16 +94,16 @@ def compare(
         settings: settings of each training. ``seed`` is the first of ``options.seeds``. The default of the steps is
             5,000, so that scenes of different sizes are comparable. Other defaults are those of ``train``.
         options: options for training, timing and presentation.
-        seeds_of: number of seeds by recipe, if it differs from ``options.seeds``.
-        steps_of: number of steps by recipe, if it differs from ``settings.steps``.
-        command_line: command line in the record, if it is not ``polarguide compare``.
+        seeds_of: number of seeds of each recipe for which it differs from ``options.seeds``.
+        steps_of: number of steps of each recipe for which it differs from ``settings.steps``.
+        command_line: command line to record if it differs from ``polarguide compare``.
         reporter: receives messages and progress.
 
     Returns:
-        The results as data frames. A failed run is in ``runs`` with its error, and does not affect others.
+        The results as data frames. A failed run is listed in ``runs`` with its error, and does not affect other runs.
 
     Raises:
-        PolarguideError: invalid input, or another comparison is writing to ``out``.
+        PolarguideError: the input is invalid, or another comparison is writing to ``out``.
     """
     comparison = Comparison(
         scenes=tuple(_folder(scene) for scene in scenes),
@@ -152,18 +153,18 @@ def ablate(
     options: CompareOptions = CompareOptions(),
     reporter: Reporter = SILENT,
 ) -> Results:
-    """Compare a recipe with its ablations. A comparison in the same folder shares its runs.
+    """Compare a recipe with its ablations. Comparisons in the same folder share their runs.
 
-    The recipe is the reference of the differences, unless ``options.against`` names another.
+    Differences are relative to the recipe, unless ``options.against`` names another reference.
 
     Args:
         scenes, out, settings, options, reporter: see ``compare``.
         base: name of the recipe.
-        only: names of the requested ablations, such as without-normals; all if empty.
+        only: names of the requested ablations, such as without-normals. If empty, all ablations are compared.
         reference: further recipes for the first rows.
 
     Raises:
-        PolarguideError: see ``compare``; or a recipe without ablations, or an unknown ablation.
+        PolarguideError: the recipe has no ablations, an ablation is unknown, or the comparison fails, see ``compare``.
     """
     return compare(
         scenes,
@@ -191,10 +192,10 @@ def ablated(base: str, only: Sequence[str] = ()) -> tuple[str, ...]:
 
     Args:
         base: name of the recipe.
-        only: requested ablations with or without ``base:`` before the name; all if empty.
+        only: names of the requested ablations, with or without the prefix ``base:``. If empty, all ablations.
 
     Raises:
-        PolarguideError: a recipe without ablations, or an unknown ablation.
+        PolarguideError: the recipe has no ablations, or an ablation is unknown.
     """
     names = [recipe.name.removeprefix(f"{base}:") for recipe in ablations_of(base)]
     require(
@@ -211,7 +212,7 @@ def ablated(base: str, only: Sequence[str] = ()) -> tuple[str, ...]:
 
 
 def _checked_recipes(recipes: Sequence[str | AnyRecipe]) -> tuple[AnyRecipe, ...]:
-    """Return registered recipes. Other processes train the runs and know recipes only by name."""
+    """Check that recipes are registered, because the processes that train them know recipes only by name."""
     registered: dict[str, AnyRecipe] = {}
     for recipe in recipes:
         own = recipe_named(recipe if isinstance(recipe, str) else recipe.name)
@@ -267,7 +268,7 @@ def _train(
 
 
 def _job(comparison: Comparison, run: PlannedRun, *, alone: bool) -> Job:
-    """Return the job that finishes a run. It measures the speed if it is ``alone`` on the machine."""
+    """Return the job that trains and scores a run. ``alone`` means that no other job runs, so the speed is measured."""
     compute = ComputeOptions(comparison.options.threads, comparison.options.device)
     folder = str(run.folder.absolute())
     training = Training(
@@ -292,7 +293,7 @@ def _job(comparison: Comparison, run: PlannedRun, *, alone: bool) -> Job:
 
 
 def _time(comparison: Comparison, plan: Sequence[PlannedRun], reporter: Reporter) -> None:
-    """Measure the rendering speed of finished runs that have none, one run at a time."""
+    """Measure the rendering speed of finished runs without this measurement, one run at a time."""
 
     def speed(run: PlannedRun) -> float | None:
         return (run.metrics() or {}).get("fps")
@@ -311,9 +312,10 @@ def _time(comparison: Comparison, plan: Sequence[PlannedRun], reporter: Reporter
 
 
 def locked(folder: Path, what: str = "comparison") -> contextlib.AbstractContextManager[None]:
-    """Lock an existing folder against other comparisons, or other work of the same kind.
+    """Lock an existing folder against other work of the kind ``what``.
 
-    Children on this machine inherit the lock. If the parent is killed, they hold it until they have saved their states.
+    Child processes on this machine inherit the lock. If the parent is killed, they hold the lock until they have saved
+    their states.
     """
     return only_writer(
         folder / ".lock", expected="a folder that nobody is writing to", found=f"another {what} at work in it"
@@ -326,13 +328,13 @@ def collect(
     plan: Sequence[PlannedRun],
     failures: Mapping[Path, str],
 ) -> Results:
-    """Return the results of the runs that are finished at this time.
+    """Collect the results of all runs that are finished now.
 
     Args:
         comparison: the requested comparison.
-        scenes: its scenes.
-        plan: its runs.
-        failures: errors of failed runs by their folders.
+        scenes: scenes of the comparison.
+        plan: runs of the comparison.
+        failures: errors of failed runs, by run folder.
     """
     options = comparison.options
     settings = comparison.settings
@@ -426,7 +428,7 @@ def _run_record(comparison: Comparison, run: PlannedRun, failure: str | None) ->
 
 
 def _write_charts(comparison: Comparison, scenes: Sequence[SceneEntry], results: Results) -> None:
-    """Write ``study.svg`` for a family of scenes, and ``exposures.svg`` for several kinds of captures."""
+    """Write charts: ``study.svg`` for a family of scenes, and ``exposures.svg`` for several kinds of captures."""
     drawn = {"study.svg": study_svg(results, {scene.name: read_study(scene.path) for scene in scenes})}
     if len(comparison.options.exposures) > 1:
         counts = {
@@ -441,7 +443,7 @@ def _write_charts(comparison: Comparison, scenes: Sequence[SceneEntry], results:
 
 
 def count_of(exposures: Exposures, views: int) -> int:
-    """Return the number of pictures that ``select_exposures`` leaves of training views with four pictures each."""
+    """Return how many pictures ``select_exposures`` keeps from ``views`` training views with four pictures each."""
     fourth = -(-views // EVERY)
     counts = {
         "three": 3 * views,

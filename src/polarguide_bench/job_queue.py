@@ -1,7 +1,7 @@
-"""Jobs on workers of dask.distributed, with progress, resume after a loss, and a stop that saves their states.
+"""Jobs on workers of dask.distributed. Jobs report progress, resume after a loss, and save their states when stopped.
 
-Workers run on this machine, behind a running scheduler, or as jobs of SLURM or PBS. The functions that need dask
-import it, because the import is slow.
+Workers run on this machine, connect to a running scheduler, or are jobs of SLURM or PBS. Only the functions that need
+dask import it, because the import is slow.
 """
 
 from __future__ import annotations
@@ -42,11 +42,11 @@ if TYPE_CHECKING:
     from distributed import Client, Future
 
 NOWHERE = f"{LOOPBACK[0]}:0"
-"""Address of dask's web servers, which cannot be disabled: any free port of the loopback interface."""
+"""Address for dask's web servers, which cannot be disabled. It is a free port of the loopback interface."""
 WORKER_BYTES = 300_000_000
-"""Memory of a worker of dask and its nanny, without the child process."""
+"""Memory of a dask worker and its supervising process (nanny), without the child process, in bytes."""
 CONNECT_SECONDS = 30.0
-"""Timeout of the connection to a running scheduler."""
+"""Timeout for the connection to a running scheduler, in seconds."""
 SETTINGS = {
     # The scheduler reports a lost worker at once: run_jobs decides whether the job resumes.
     "distributed.scheduler.allowed-failures": 0,
@@ -58,17 +58,17 @@ SETTINGS = {
     "distributed.admin.tick.interval": "1s",
     "distributed.admin.system-monitor.interval": "10s",
 }
-"""Settings of dask."""
+"""Settings that are passed to dask."""
 
 
 @dataclass
 class Workers:
-    """Worker processes. Lost workers are replaced.
+    """Worker processes of a comparison or batch. Lost workers are replaced.
 
     Attributes:
         client: connection to the scheduler.
-        most: largest number of simultaneous jobs, and of workers.
-        gpus: GPUs of this machine that its workers use in turn. If empty, each worker uses all.
+        most: largest number of workers, each of which runs one job at a time.
+        gpus: GPUs of this machine, which are distributed over its workers. If empty, each worker uses all GPUs.
     """
 
     client: Client
@@ -77,11 +77,11 @@ class Workers:
     _cluster: Any = field(default=None, repr=False)
 
     def slots(self) -> int:
-        """Return the number of jobs that the present workers can run."""
+        """Return the number of jobs that the connected workers can run at the same time."""
         return sum(self.client.nthreads().values())
 
     def replace_lost(self) -> None:
-        """Request new workers for lost ones."""
+        """Request new workers to replace lost ones."""
         if self._cluster is not None:
             self._cluster.scale(self.most)
 
@@ -90,10 +90,10 @@ class Workers:
 def workers(
     options: ClusterOptions, *, count: int, threads: int, memory: int, gpus: Sequence[str], reporter: Reporter
 ) -> Iterator[Workers]:
-    """Start or connect workers, and stop them at the end of the context.
+    """Start workers or connect to running ones, and stop the started workers at the end of the context.
 
     Args:
-        options: place of the workers.
+        options: options that select where workers run.
         count: number of simultaneous jobs.
         threads: threads of each job.
         memory: upper bound of the memory of each job in bytes.
@@ -101,7 +101,8 @@ def workers(
         reporter: receives a message about the workers.
 
     Raises:
-        PolarguideError: no such scheduler, or dask-jobqueue or a command of the cluster's manager is missing.
+        PolarguideError: the scheduler does not answer, dask-jobqueue is missing, or a command of the cluster manager is
+            missing.
     """
     import dask
     from distributed import Client, LocalCluster
@@ -156,7 +157,7 @@ def _connected(address: str) -> Client:
 def _queued(manager: str, count: int, threads: int, memory: int) -> Any:
     """Return a cluster whose workers are jobs of SLURM or PBS.
 
-    dask reads queue, account, time and other settings of the site from its configuration (jobqueue.yaml).
+    dask reads queue, account, time limit and other settings of the cluster from its configuration (jobqueue.yaml).
     """
     import dask
 
@@ -202,29 +203,29 @@ def _no_cluster(manager: str, found: str) -> PolarguideError:
 
 
 def _mib(memory: int) -> int:
-    """Return the memory of a job with its worker in MiB."""
+    """Return the memory of a job and its worker, in MiB."""
     return math.ceil((memory + WORKER_BYTES) / MEBIBYTE)
 
 
 SLOTS_SECONDS = 1.0
-"""Interval between queries of a scheduler, which may be remote."""
+"""Interval between queries to a scheduler, which may be remote, in seconds."""
 TAIL_BYTES = 4096
-"""Size of the end of a log that is searched for its last row."""
+"""Number of bytes at the end of a log that are searched for its last row."""
 MOST_LOSSES = 10
-"""Largest number of consecutive losses of a job without a new checkpoint. Its memory may not suffice."""
+"""Largest number of losses of a job without a new checkpoint. After more losses, memory is probably insufficient."""
 
 
 @dataclass(frozen=True)
 class Job:
-    """Tasks that one worker performs in turn.
+    """Sequence of tasks that one worker performs.
 
     Attributes:
         label: name in messages.
         folder: folder for the ``stderr.txt`` of the processes, created if missing.
-        tasks: returns the remaining tasks according to the folder. It is called at each start and resume.
+        tasks: function that reads the folder and returns the remaining tasks. It is called at each start and resume.
         total: amount of work, in the unit of ``progress``.
-        progress: returns the finished amount of work and a short note.
-        saved: files that change with each saved state.
+        progress: function that returns the finished amount of work and a short note.
+        saved: files that change whenever a state is saved.
     """
 
     label: str
@@ -256,7 +257,7 @@ def training_progress(run: Path, steps: int) -> tuple[int, str]:
 
 @dataclass(frozen=True)
 class _ActiveJob:
-    """A job on a worker. ``advance`` updates its progress bar; ``bar`` closes it."""
+    """Job that runs on a worker. ``advance`` updates its progress bar, and ``bar`` closes it."""
 
     job: Job
     future: Future
@@ -265,14 +266,14 @@ class _ActiveJob:
 
 
 class _Progress:
-    """Progress bars: one for all jobs, and one for each active job."""
+    """Progress bars: one for all jobs together, and one for each active job."""
 
     def __init__(self, jobs: Sequence[Job], reporter: Reporter, stack: contextlib.ExitStack) -> None:
         self._done = {job.folder: job.progress()[0] for job in jobs}
         self._all = stack.enter_context(reporter.track("all", sum(job.total for job in jobs)))
 
     def report(self, active: Sequence[_ActiveJob], waiting: int, slots: int) -> None:
-        """Update all bars."""
+        """Update all progress bars."""
         for each in active:
             done, note = each.job.progress()
             each.advance(done, note=note)
@@ -292,16 +293,16 @@ def run_jobs(
     reporter: Reporter,
     on_end: Callable[[Job, str | None], None] = lambda job, error: None,
 ) -> None:
-    """Run jobs on workers. A failed job does not affect others; a lost job resumes on another worker.
+    """Run jobs on workers. A failed job does not affect other jobs. A lost job resumes on another worker.
 
     Args:
-        jobs: the jobs in their order.
-        workers: workers with one job each at a time.
+        jobs: jobs in the order in which they start.
+        workers: workers, each of which runs one job at a time.
         reporter: receives progress, and a line at the end of each job.
-        on_end: called after each job with its error or None.
+        on_end: function that is called after each job with its error, or with None if it succeeded.
 
     Raises:
-        KeyboardInterrupt: Ctrl-C; raised again after all children have stopped.
+        KeyboardInterrupt: the user pressed Ctrl-C. It is raised after all children have stopped.
         PolarguideError: the connection to the scheduler was lost.
     """
     waiting = deque(jobs)
@@ -355,7 +356,7 @@ def _submit(job: Job, workers: Workers, reporter: Reporter, stack: contextlib.Ex
 
 
 def _outcome_of(future: Future) -> Outcome:
-    """Return the outcome of a finished job.
+    """Return the result of a finished job.
 
     Raises:
         PolarguideError: the connection to the scheduler was lost.
@@ -379,11 +380,11 @@ def _outcome_of(future: Future) -> Outcome:
 
 
 def _is_last_loss(job: Job, losses: dict[Path, tuple[int, int]]) -> bool:
-    """Count a loss of a job, and return True if it has no more retries.
+    """Count a loss of a job, and return True if the job may not be retried again.
 
     Args:
         job: the lost job.
-        losses: modification time of the last saved state, and the losses since, by the folder of a job.
+        losses: for each job folder, the modification time of the last saved state, and the number of losses since then.
     """
     saved = max((path.stat().st_mtime_ns for path in job.saved if path.exists()), default=0)
     before, count = losses.get(job.folder, (saved, 0))
@@ -392,7 +393,7 @@ def _is_last_loss(job: Job, losses: dict[Path, tuple[int, int]]) -> bool:
 
 
 def _stop(futures: Sequence[Future], client: Client) -> None:
-    """Cancel jobs and wait for the end of their processes. A second Ctrl-C kills the processes."""
+    """Cancel jobs and wait until their processes have ended. A second Ctrl-C kills the processes."""
     keys = [future.key for future in futures]
     with contextlib.suppress(Exception):  # the scheduler may have failed itself
         client.cancel(futures, force=True)
@@ -404,7 +405,7 @@ def _stop(futures: Sequence[Future], client: Client) -> None:
 
 
 class LogRow(msgspec.Struct):
-    """Fields of a row of a log that progress shows."""
+    """Fields in a row of a training log that are needed to show progress."""
 
     step: Annotated[int, msgspec.Meta(ge=0)]
     psnr: float | None = None
@@ -415,7 +416,7 @@ _ROWS = msgspec.json.Decoder(LogRow)
 
 
 def last_row(log: Path) -> LogRow | None:
-    """Return the last complete row of a log; None without one."""
+    """Return the last complete row of a log, or None if there is no complete row."""
     try:
         if not log.is_file():  # reading a pipe may never end
             return None

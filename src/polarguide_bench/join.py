@@ -1,4 +1,4 @@
-"""``polarguide tables``: join the records of several comparisons, and write their tables.
+"""The verb ``polarguide tables``, which joins the records of several comparisons and writes their tables.
 
 The tables can also have the layout of PolarGuide-GSDR (Shan et al. 2026): measured values next to the published ones.
 """
@@ -53,7 +53,7 @@ METRICS: Mapping[str, tuple[str, ...]] = {
     "LPIPS": ("lpips", "flip"),
     "FPS": ("fps",),
 }
-"""Keys of each published metric. If no run has a value of the first key, the next one replaces it."""
+"""Keys of our metrics for each published metric, in order of preference. The first key with a value is used."""
 _CAPTURES = (
     "The published values come from other captures. Compare differences between methods, not values.",
     "The publication gives different values of one method in its two tables: up to 0.2 dB, 0.006 SSIM and 0.01 LPIPS.",
@@ -62,12 +62,12 @@ _CAPTURES = (
 
 @dataclass(frozen=True)
 class PublicationLayout:
-    """Layout of one table of the publication.
+    """Layout of a table in the publication.
 
     Attributes:
-        name: value of ``--layout``, and name of the files.
+        name: value of the option ``--layout`` and name of the files.
         title: heading.
-        columns: heading of each method and its recipe.
+        columns: heading and recipe of each method.
     """
 
     name: str
@@ -75,7 +75,7 @@ class PublicationLayout:
     columns: Mapping[str, str]
 
     def published(self) -> pd.DataFrame:
-        """Return the published values: dataset, metric, and a column for each method. Values are printed text."""
+        """Return the published values as text, with the columns dataset and metric and a column for each method."""
         source = files("polarguide_bench").joinpath("published", f"{self.name}.csv")
         with source.open(encoding="utf-8") as file:
             return pd.read_csv(file, dtype=str)
@@ -115,7 +115,7 @@ LAYOUTS = {
 
 
 def write_publication_tables(out: Path, results: Results, layout: PublicationLayout) -> None:
-    """Write ``NAME.md`` and ``NAME.tex`` with the measured and the published table.
+    """Write ``NAME.md`` and ``NAME.tex``, which contain the measured and the published table.
 
     Raises:
         PolarguideError: the record has fewer than two of the layout's recipes.
@@ -126,7 +126,9 @@ def write_publication_tables(out: Path, results: Results, layout: PublicationLay
 
 
 def measured_section(results: Results, layout: PublicationLayout) -> Section:
-    """Return the values of a record in the publication's layout: a block for each scene, a row for each metric.
+    """Return the values of a record in the layout of the publication.
+
+    It has a block for each scene and a row for each metric.
 
     Raises:
         PolarguideError: the record has fewer than two of the layout's recipes.
@@ -161,7 +163,7 @@ def measured_section(results: Results, layout: PublicationLayout) -> Section:
 
 
 def _earlier_versions(results: Results, names: Iterable[str]) -> Iterator[str]:
-    """Yield a sentence for each recipe whose recorded values differ from its present ones."""
+    """Yield a sentence for each recipe whose recorded definition differs from its current definition."""
     trained = {recipe.name: recipe.data for recipe in results.record.recipes}
     for name in names:
         if recipe_named(name).differs(trained[name]):
@@ -170,7 +172,7 @@ def _earlier_versions(results: Results, names: Iterable[str]) -> Iterator[str]:
 
 
 def published_section(layout: PublicationLayout) -> Section:
-    """Return the published values. The best picture quality is bold, as in the publication."""
+    """Return the published table. The best picture quality is bold, as in the publication."""
     frame = layout.published()
     methods = list(frame.columns[2:])
     blocks: dict[str, list[TableRow]] = {}
@@ -203,7 +205,7 @@ def _label(metric: Metric) -> str:
 RECORD = "results.json"
 _REMEDY = "Join records of one commit, with the same recipes and settings."
 _FREE = ("jobs", "seeds", "against")
-"""Settings that may differ between parts of a comparison. The joined record has the largest count."""
+"""Settings that may differ between joined records. The joined record contains the largest count."""
 
 
 def join_tables(
@@ -220,14 +222,14 @@ def join_tables(
     ``differences.csv`` and ``parts.csv`` if they have rows.
 
     Args:
-        parts: records, or folders with a ``results.json``. They define the order of scenes and recipes.
+        parts: records, or folders that contain ``results.json``. Their order defines the order of scenes and recipes.
         out: output folder.
-        against: reference recipe. Tables show the difference of each other recipe to it.
+        against: reference recipe. Tables show the difference between each recipe and the reference.
         layout: layout of a publication for an additional table, ``LAYOUT.md`` and ``LAYOUT.tex``.
 
     Raises:
-        PolarguideError: a file that is not a record, or would be overwritten; records of different code, settings,
-            scenes or recipes; a duplicate run; an unknown ``against``; a layout without its recipes in the records.
+        PolarguideError: a file is not a record or would be overwritten. Records differ in code, settings, scenes or
+            recipes. A run occurs twice. ``against`` is unknown. The records lack recipes of the layout.
     """
     paths = [Path(part) / RECORD if Path(part).is_dir() else Path(part) for part in parts]
     require(paths, "tables", expected="a record", found="none", remedy="Name at least one results.json.")
@@ -251,10 +253,10 @@ def join_tables(
 
 
 def join_records(records: dict[str, Record], *, against: str | None = None) -> Record:
-    """Join the runs of several records to one record.
+    """Join the runs of several records into one record.
 
     Args:
-        records: at least one record, by its name in messages.
+        records: at least one record, by the name that messages use for it.
         against: reference recipe; see ``join_tables``.
 
     Raises:
@@ -320,7 +322,10 @@ def _unique(texts: Iterable[str]) -> str:
 
 
 def _check_same_code(ours: Provenance, theirs: Provenance, label: str, name: str) -> None:
-    """Check that versions are equal, and commits or digests. Compilers may make different digests of one commit."""
+    """Check that two records have the same version, and the same commit or digest.
+
+    Digests of the same commit may differ, because they include the compiled library.
+    """
     _check_same(ours.version, theirs.version, f"{name} (provenance.version)", label)
     if (ours.commit is None or ours.commit != theirs.commit) and ours.sources != theirs.sources:
         code, other_code = (f"{of.sources}, commit {of.commit}" for of in (ours, theirs))

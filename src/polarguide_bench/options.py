@@ -1,4 +1,7 @@
-"""Options of comparisons, batches and the bench, and the bench as data. This module does not import torch."""
+"""Options of comparisons, batches and the bench, and the definition of the bench.
+
+This module does not import torch, so that the command line starts quickly.
+"""
 
 from __future__ import annotations
 
@@ -21,9 +24,9 @@ from polarguide.training.settings import TrainSettings
 from polarguide_synth.settings import SynthSettings
 
 MOST_SEEDS = 1000
-"""Largest number of seeds. Each recipe and scene has a run for each seed."""
+"""Largest number of seeds."""
 LayoutName = Literal["publication-1", "publication-2"]
-"""Tables of PolarGuide-GSDR: its comparison of methods, and its ablations."""
+"""Tables of the publication PolarGuide-GSDR. The first compares methods, the second compares ablations."""
 
 
 @dataclass(frozen=True)
@@ -60,14 +63,14 @@ class ClusterOptions:
 
     @property
     def manager(self) -> Literal["slurm", "pbs"] | None:
-        """Manager of the cluster, if any."""
+        """Cluster manager that runs the jobs, or None without a cluster."""
         if self.slurm:
             return "slurm"
         return "pbs" if self.pbs else None
 
     @property
     def local(self) -> bool:
-        """True if this machine computes."""
+        """True if the jobs run on this machine."""
         return self.scheduler is None and self.manager is None
 
 
@@ -134,15 +137,15 @@ class BatchOptions(ClusterOptions):
 
 @dataclass(frozen=True)
 class Bench:
-    """A fixed set of rendered scenes, and of rows to compare on them.
+    """Benchmark: a fixed set of rendered scenes, and the recipes to compare on them.
 
     Attributes:
         development: presets or scene files for the development of methods.
         held_back: presets or scene files that must not be used for tuning.
         synth: settings of the rendering.
         views: views of each scene.
-        rows: names of recipes in the order of the tables, and the number of seeds of each.
-        training: settings of each training, with the first seed.
+        rows: name and number of seeds of each recipe, in the order of the tables.
+        training: settings of each training. Their seed is the first of the seeds.
     """
 
     development: tuple[str, ...]
@@ -174,7 +177,7 @@ BENCH = Bench(
     },
     training=TrainSettings(steps=2500, seed=0, refractive_index=1.5),
 )
-"""The bench of the published tables. Results of a changed bench are not comparable with them."""
+"""Bench with which the published tables were made. Results of a changed bench are not comparable with these tables."""
 
 
 @dataclass(frozen=True)
@@ -196,11 +199,11 @@ class BenchOptions(ClusterOptions):
 
     @property
     def half(self) -> Literal["development", "held-back"]:
-        """Requested half."""
+        """Name of the requested half of the bench."""
         return "held-back" if self.held_back else "development"
 
     def comparing(self, seeds: int) -> CompareOptions:
-        """Return the options of the comparison."""
+        """Return the options of the comparison, with a number of seeds."""
         place = {field.name: getattr(self, field.name) for field in fields(ClusterOptions)}
         return CompareOptions(**place, seeds=seeds, device=self.device)
 
@@ -208,7 +211,7 @@ class BenchOptions(ClusterOptions):
         """Return the requested scenes in the order of the bench.
 
         Raises:
-            PolarguideError: a scene of the other half, or an unknown scene.
+            PolarguideError: a scene belongs to the other half or is unknown.
         """
         half = bench.held_back if self.held_back else bench.development
         for name in self.scenes:

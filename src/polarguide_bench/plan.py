@@ -1,7 +1,7 @@
-"""Plan of a comparison: its runs, their folders and states, and the number of simultaneous runs.
+"""Plan of a comparison, which determines its runs, their folders, and the number of simultaneous runs.
 
-The name of a run folder contains a digest of all inputs of the result. The same command therefore finds finished runs,
-and changed inputs lead to a new folder.
+The name of a run folder contains a digest of all inputs that determine the result. So the same command finds finished
+runs, and changed inputs lead to a new folder.
 """
 
 from __future__ import annotations
@@ -44,13 +44,13 @@ State = Literal["new", "begun", "trained", "done"]
 
 @dataclass(frozen=True)
 class TableRow:
-    """A row of the tables: a recipe and the pictures of its training.
+    """Row of the tables: a recipe, and the kind of pictures on which it is trained.
 
     Attributes:
-        name: name in tables and of run folders.
+        name: name in tables and in the names of run folders.
         recipe: the recipe.
-        exposures: pictures of the training.
-        steps: own number of steps, if any.
+        exposures: kind of pictures on which the recipe is trained.
+        steps: number of steps of this row, or None for the number of the comparison.
     """
 
     name: str
@@ -60,7 +60,7 @@ class TableRow:
 
     @property
     def about(self) -> str:
-        """Description in one line."""
+        """Description of the row in one line."""
         named = self.name == self.recipe.name
         about = self.recipe.about if named else f"{self.recipe.name}, {self.exposures}"
         return about if self.steps is None else f"{about.removesuffix('.')}; {self.steps:,} steps."
@@ -68,17 +68,17 @@ class TableRow:
 
 @dataclass(frozen=True)
 class Comparison:
-    """A requested comparison.
+    """Request for a comparison.
 
     Attributes:
         scenes: scene folders.
         recipes: recipes in the order of the tables.
-        settings: settings of each training, with the first seed.
+        settings: settings of each training. Their seed is the first of the seeds.
         options: options for training, timing and presentation.
         out: output folder.
-        seeds_of: number of seeds by recipe, if it differs from ``options.seeds``.
-        steps_of: number of steps by recipe, if it differs from ``settings.steps``.
-        command_line: command line for the record, if it is not ``polarguide compare``.
+        seeds_of: number of seeds of each recipe for which it differs from ``options.seeds``.
+        steps_of: number of steps of each recipe for which it differs from ``settings.steps``.
+        command_line: command line to record if it differs from ``polarguide compare``.
     """
 
     scenes: tuple[Path, ...]
@@ -108,7 +108,7 @@ class Comparison:
 
     @property
     def command(self) -> str:
-        """Command line that requests the same comparison."""
+        """Command line that repeats this comparison."""
         settings = self.settings
         options = self.options
         arguments: dict[str, Sequence[object]] = {
@@ -135,17 +135,17 @@ class Comparison:
 
 @dataclass(frozen=True)
 class SceneEntry:
-    """Facts about a scene for the record.
+    """Facts about a scene, for the record of the comparison.
 
     Attributes:
         path: scene folder.
-        name: its name.
-        digest: SHA-256 of its files.
+        name: name of the scene.
+        digest: SHA-256 of the files of the scene.
         views: number of views.
         test_views: names of the test views.
         black_share: share of black pixels in the first test view.
-        warnings: limits of the scores because of missing ground truth, a sentence each.
-        refractive_index: index in ``scene.json``, if any.
+        warnings: sentences about scores that are limited because ground truth is missing.
+        refractive_index: refractive index in ``scene.json``, or None if it contains none.
     """
 
     path: Path
@@ -160,13 +160,13 @@ class SceneEntry:
 
 @dataclass(frozen=True)
 class PlannedRun:
-    """A training: a scene, a row of the tables with its recipe, and a seed.
+    """Training of a comparison: a recipe on a scene with a seed.
 
     Attributes:
         scene: the scene.
-        row: row of the tables.
-        steps: steps of the training.
-        settings: requested settings. ``train`` resolves the open ones.
+        row: row of the tables, which defines the recipe.
+        steps: number of steps of the training.
+        settings: requested settings. ``train`` chooses the settings that are not specified.
         reading: options for reading the scene.
         folder: run folder.
     """
@@ -180,11 +180,11 @@ class PlannedRun:
 
     @property
     def label(self) -> str:
-        """Name in messages."""
+        """Name of the run in messages."""
         return f"{self.scene.name}, {self.row.name}, seed {self.settings.seed}"
 
     def state(self) -> State:
-        """Return the state of the run according to its folder."""
+        """Return the state of the run, read from its folder."""
         if not (self.folder / CONFIGURATION).exists():
             return "new"
         try:
@@ -219,7 +219,7 @@ class PlannedRun:
         return "trained" if finished and not moved else "begun"
 
     def metrics(self) -> dict[str, Any] | None:
-        """Read the record of the scores; None without a valid record of this version."""
+        """Read the scores of the run. Return None if there is no valid record of this version."""
         try:
             record = read_metrics(self.folder)
         except (OSError, PolarguideError):
@@ -229,10 +229,10 @@ class PlannedRun:
 
 
 def scene_entries(comparison: Comparison, reporter: Reporter = SILENT) -> list[SceneEntry]:
-    """Read each scene once. Warn about scores that are not comparable.
+    """Read the facts about each scene, and warn about scores that are not comparable.
 
     Raises:
-        PolarguideError: a scene is invalid, has no test views, or has the same name as another.
+        PolarguideError: a scene is invalid, has no test views, or has the same name as another scene.
     """
     entries: list[SceneEntry] = []
     for path in comparison.scenes:
@@ -274,12 +274,12 @@ def scene_entries(comparison: Comparison, reporter: Reporter = SILENT) -> list[S
 
 
 def black_share(view: View) -> float:
-    """Return the share of a view's pixels that are black."""
+    """Return the share of black pixels in a view."""
     return float(black_pixels(view).float().mean())
 
 
 def plan_runs(comparison: Comparison, scenes: Sequence[SceneEntry]) -> list[PlannedRun]:
-    """Return all runs, scene by scene, then seed by seed, so that the first results compare all recipes."""
+    """Return all runs, sorted by scene and then by seed, so that the first finished runs compare all recipes."""
     counts = {
         row.name: comparison.seeds_of.get(row.recipe.name, comparison.options.seeds)
         for row in comparison.rows
@@ -316,14 +316,14 @@ def _planned(comparison: Comparison, scene: SceneEntry, row: TableRow, seed: int
 def run_key(
     scene_digest: str, recipe: Mapping[str, Any], settings: TrainSettings, reading: SceneOptions, *, code: str
 ) -> str:
-    """Return a short digest of all inputs of a training.
+    """Return a short digest of all inputs that determine the result of a training.
 
     Args:
         scene_digest: SHA-256 of the scene's files.
         recipe: all values of the recipe.
         settings: settings of the training.
         reading: options for reading the pictures.
-        code: version of the training code.
+        code: digest of the training code.
 
     Returns:
         Ten hexadecimal digits.
@@ -334,10 +334,10 @@ def run_key(
 
 
 def most_memory(runs: Sequence[PlannedRun]) -> int:
-    """Return an upper bound of the memory of each training in bytes, computed from file headers.
+    """Return an upper bound of the memory of a training in bytes, computed from file headers.
 
     Raises:
-        PolarguideError: a scene is missing, or its ``--memory`` is too small.
+        PolarguideError: a scene is missing, or ``--memory`` is too small for it.
     """
     scales = {run.scene.path: run.reading.downscale for run in runs}
     pixels = {path: pixels_of(path, downscale) for path, downscale in scales.items()}
@@ -354,7 +354,7 @@ def _expected_memory(run: PlannedRun, pixels: Sequence[int]) -> int:
 
 
 def own_gpus(backend: Backend) -> tuple[str, ...]:
-    """Return the names of this machine's GPUs for CUDA_VISIBLE_DEVICES; none if the CPU computes."""
+    """Return the names of this machine's GPUs for CUDA_VISIBLE_DEVICES, or () if ``backend`` uses the CPU."""
     if backend.device.type != "cuda":
         return ()
     visible = [name for name in os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",") if name.strip()]
@@ -362,13 +362,13 @@ def own_gpus(backend: Backend) -> tuple[str, ...]:
 
 
 def jobs_at_a_time(options: ClusterOptions, count: int, memory: int, gpus: Sequence[str]) -> int:
-    """Return the number of simultaneous jobs: from one to the number of jobs.
+    """Return the number of jobs that run at the same time, at least one and at most ``count``.
 
     Args:
-        options: place of the computation, and the requested number, if any.
+        options: options of the computation, which may specify the number.
         count: number of jobs.
         memory: upper bound of the memory of each job in bytes.
-        gpus: GPUs of this machine, one for each job.
+        gpus: GPUs of this machine. Each job uses one of them.
     """
     if options.jobs or not options.local:
         return max(1, min(options.jobs or count, count))
@@ -381,7 +381,7 @@ def jobs_at_a_time(options: ClusterOptions, count: int, memory: int, gpus: Seque
 def trained_steps(run: Path) -> int | None:
     """Return the number of training steps at a run's checkpoint.
 
-    None if the run has no checkpoint, or if the checkpoint does not record the number.
+    Return None if the run has no checkpoint, or if the checkpoint does not record the number.
     """
     try:
         with safe_open(run / CHECKPOINT, framework="pt") as file:
@@ -392,15 +392,15 @@ def trained_steps(run: Path) -> int | None:
 
 
 def compared_steps(*specified: int | None) -> int:
-    """Return the steps of a run of a comparison: the first specified number, else ``STEPS``.
+    """Return the first number of steps that is not None, or ``STEPS`` if all are None.
 
-    They do not depend on the size of the pictures, so that scenes are comparable.
+    In a comparison, the number does not depend on the size of the pictures, so that scenes are comparable.
     """
     return next((steps for steps in specified if steps is not None), STEPS)
 
 
 def model_digest(kind: type) -> str:
-    """Return the digest of the file of a plug-in's shading model; empty for models of this package."""
+    """Return a digest of the source file of a plug-in's shading model. It is empty for models of this package."""
     file = Path(inspect.getfile(kind))
     return "" if PACKAGE in file.parents else _digest(file.parent, [file])
 
@@ -409,7 +409,7 @@ def open_compared(folder: str | Path, device: DeviceName = "auto") -> OpenedRun 
     """Open a run of a comparison.
 
     Raises:
-        PolarguideError: the folder is not a run, is damaged, or belongs to another version.
+        PolarguideError: the folder is not a run, is damaged, or was written by another version.
     """
     recipe = recipe_named(RunConfiguration.load(Path(folder)).recipe)
     if isinstance(recipe, Recipe):

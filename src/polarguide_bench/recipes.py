@@ -1,6 +1,6 @@
-"""Recipes of comparisons: the recipes of the product, their ablations, and GNeRP.
+"""Recipes that can be compared: the recipes of polarguide, their ablations, and GNeRP.
 
-An ablation is a recipe with one change, defined as data.
+An ablation is a recipe with one change, for example without a loss term.
 """
 
 from __future__ import annotations
@@ -37,24 +37,24 @@ AnyRecipe = Recipe | NeuralRecipe
 
 
 def priors(**values: Any) -> Change:
-    """Change values of the recipe's ``Priors``."""
+    """Return a change of values in the recipe's ``Priors``."""
     return lambda recipe: replace(recipe, priors=replace(recipe.priors, **values))
 
 
 def shading(**values: Any) -> Change:
-    """Change values of the shading model."""
+    """Return a change of values in the recipe's shading model."""
     return lambda recipe: replace(recipe, shading=replace(recipe.shading, **values))
 
 
 def firm_to_the_end(base: Recipe) -> Recipe:
-    """Use rates and weights of the guided stage in the final stage, except the weights of the layers."""
+    """Use the rates and weights of the guided stage in the final stage as well, except the weights of the layers."""
     *before, final = base.stages
     weights = replace(before[-1].weights, specular=0.0, diffuse=0.0)
     return replace(base, stages=(*before, replace(final, weights=weights, rate_factors={})))
 
 
 def release_rates(**others: float) -> Change:
-    """Use the rates of the geometry of the 3DGS release. ``others`` are further rates of it."""
+    """Return a change to the geometry's learning rates in the 3DGS release. ``others`` adds other parameters."""
     slow = {"means": 1.6e-4, "log_scales": 5e-3, **others}
     return lambda recipe: replace(recipe, rates={**recipe.rates, **slow}, means_decay=0.01)
 
@@ -150,12 +150,12 @@ ABLATIONS_3DGS_DR = varied(
 
 
 def layers_before_the_blend(weights: Weights) -> Weights:
-    """Compare mirrored light and base color before the blend with the reflection strength."""
+    """Apply the loss to mirrored light and base color themselves, before the reflection strength blends them."""
     return replace(weights, specular=0.0, diffuse=0.0, reflection=weights.specular, base=weights.diffuse)
 
 
 def layers_after_the_blend(weights: Weights) -> Weights:
-    """Compare the contributions of the layers to the picture."""
+    """Apply the loss to the contribution of each layer to the picture, after the reflection strength blends them."""
     return replace(weights, specular=weights.reflection, diffuse=weights.base, reflection=0.0, base=0.0)
 
 
@@ -169,7 +169,7 @@ _PUBLISHED = (
     ),
     UNPOLARIZED,
 )
-"""The two ablations of the publication, another interpretation of its normal term, and the control."""
+"""Ablations of the publication, a variant of its normal term, and the control without polarization."""
 
 ABLATIONS_PAPER = (
     RECIPE_POLARGUIDE_PAPER_KIND,
@@ -283,7 +283,7 @@ ABLATIONS_GNERP = (
 )
 
 FIELDS: dict[str, NeuralRecipe] = {recipe.name: recipe for recipe in (RECIPE_GNERP, *ABLATIONS_GNERP)}
-"""Recipes of signed-distance fields by name. Only comparisons train them."""
+"""Recipes that train signed-distance fields, by name. Only comparisons use them."""
 
 ABLATIONS: dict[str, tuple[AnyRecipe, ...]] = {
     "3dgs": ABLATIONS_3DGS,
@@ -294,12 +294,12 @@ ABLATIONS: dict[str, tuple[AnyRecipe, ...]] = {
     "polarguide-stokes": ABLATIONS_STOKES,
     "gnerp": ABLATIONS_GNERP,
 }
-"""Ablations of a recipe by its name. Their names are ``recipe:variation``."""
+"""Ablations of each recipe, by the name of the recipe. An ablation is named ``recipe:variation``."""
 
 VARIATIONS: dict[str, Recipe] = {
     recipe.name: recipe for recipes in ABLATIONS.values() for recipe in recipes if isinstance(recipe, Recipe)
 }
-"""All ablations of Gaussians by name. The product finds names with a colon here."""
+"""All ablations of Gaussian recipes by name. polarguide looks up names with a colon here."""
 
 
 def recipe_named(name: str) -> AnyRecipe:
@@ -312,10 +312,10 @@ def recipe_named(name: str) -> AnyRecipe:
 
 
 def ablations_of(name: str) -> tuple[AnyRecipe, ...]:
-    """Return the ablations of a recipe, which may be none. Plug-ins offer theirs as ``name:variation``.
+    """Return the ablations of a recipe, including those that plug-ins register as ``name:variation``.
 
     Raises:
-        PolarguideError: an unknown recipe.
+        PolarguideError: the recipe is unknown.
     """
     if name in ABLATIONS or name in registry.RECIPES:
         return ABLATIONS.get(name, ())

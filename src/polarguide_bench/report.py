@@ -1,6 +1,6 @@
 """Report of a comparison: one self-contained HTML file with tables, curves and pictures.
 
-Its charts are SVG: training curves, and scores over a studied parameter or over the number of pictures.
+Its charts are SVG. They show training curves, and scores over a studied parameter or over the number of pictures.
 """
 
 from __future__ import annotations
@@ -40,41 +40,41 @@ Numbers = NDArray[np.float64]
 POINTS = 240
 """Largest number of points of a curve."""
 SMOOTHED_SHARE = 0.05
-"""Share of a training in the running mean of a curve. Single steps show single views, which differ by decibels."""
+"""Width of the running mean of a curve, as a share of the training. Single steps are noisy, because views differ."""
 DASHES = ("none", "7 4", "2 3")
-"""Dashes of curves. Eight colors repeat with the next dashes."""
+"""Dash patterns of curves. After eight curves, the colors repeat with the next pattern."""
 STUDIED = ("psnr", "normal_mae_deg")
-"""Metrics over a studied parameter."""
+"""Metrics that are drawn over a studied parameter."""
 NAMES = {
     "views": "training views",
     "noise": "noise (1: exposed to full scale, 2: a quarter of that light)",
     "index": "refractive index",
     "spacing": "degrees between neighboring views",
 }
-"""Labels of the axis by studied parameter, if its name is not enough."""
+"""Axis labels of studied parameters whose names are not clear."""
 OVER_PICTURES = ("psnr_foreground", "normal_mae_deg", "specular_psnr", "diffuse_psnr")
-"""Metrics over the number of pictures."""
+"""Metrics that are drawn over the number of pictures."""
 APART = 0.12
-"""Distance between the points of two scenes in a column, as a share of its width."""
+"""Horizontal distance between the points of two scenes in a column, as a share of the column's width."""
 
 
 class Series(NamedTuple):
-    """Points of one color: x, y, and the text under the pointer. Points without text are not drawn."""
+    """Points of one color: x, y, and the tooltip of each point. A point with an empty tooltip is not drawn."""
 
     name: str
     points: list[tuple[float, float, str]]
 
 
 class Panel(NamedTuple):
-    """A pair of axes.
+    """Part of a chart: a pair of axes with its points.
 
     Attributes:
         title: title above the axes.
         axis: label of the x axis.
-        series: the points.
-        x_ticks: places and lines of text at the x axis.
-        x_ends: ends of the x axis.
-        y_ticks: numbers at the y axis.
+        series: points to draw, grouped by color.
+        x_ticks: position and lines of text of each label at the x axis.
+        x_ends: smallest and largest value of the x axis.
+        y_ticks: numbers to label at the y axis.
     """
 
     title: str
@@ -86,13 +86,14 @@ class Panel(NamedTuple):
 
 
 def panel(title: str, axis: str, series: list[Series], columns: Sequence[list[str]] = ()) -> Panel:
-    """Return a panel that contains all points.
+    """Create a panel whose axes contain all points.
 
     Args:
         title: title above the axes.
         axis: label of the x axis.
         series: the points.
-        columns: lines of text at the places 0, 1, ... of the x axis. If empty, the axis has round numbers.
+        columns: lines of text below the positions 0, 1, ... of the x axis. If empty, the axis is labeled with round
+            numbers.
     """
     x, y, _ = zip(*(point for of in series for point in of.points), strict=True)
     y_ticks = ticks(min(y), max(y))
@@ -105,7 +106,7 @@ def panel(title: str, axis: str, series: list[Series], columns: Sequence[list[st
 
 
 def ticks(low: float, high: float) -> list[float]:
-    """Return about six round numbers at equal distances that enclose [low, high]."""
+    """Return about six evenly spaced round numbers that enclose [low, high]."""
     rough = max(high - low, 1e-6) / 6
     power = 10.0 ** math.floor(math.log10(rough))
     step = next(power * factor for factor in (1, 2, 5, 10) if power * factor >= rough * 0.999)
@@ -122,7 +123,7 @@ def chart(
     label: str = "scores",
     size: tuple[int, int] = (430, 330),
 ) -> str:
-    """Return an SVG file. Colors follow the order of the legend; ``size`` is the width and height of a panel."""
+    """Draw panels as an SVG file. The legend defines the order of colors; ``size`` is width and height of a panel."""
     width, height = size
     return (
         templates(BASE)
@@ -134,7 +135,7 @@ def chart(
 
 
 class Curve(NamedTuple):
-    """Smoothed PSNR in dB [P] of a run over steps [P] and seconds [P]."""
+    """Training curve of a run: smoothed PSNR in dB [P], with steps [P] and seconds [P]."""
 
     name: str
     steps: Numbers
@@ -143,7 +144,10 @@ class Curve(NamedTuple):
 
 
 def read_curve(run: Path, name: str) -> Curve | None:
-    """Read the curve of a run from its log, with at most ``POINTS`` points; None for fewer than two points."""
+    """Read the training curve of a run from its log, with at most ``POINTS`` points.
+
+    Return None for fewer than two points.
+    """
     measured = [(row["step"], row.get("seconds"), row.get("psnr")) for row in RunLog(run).rows()]
     rows = [row for row in measured if None not in row]
     if len(rows) < 2:
@@ -154,7 +158,11 @@ def read_curve(run: Path, name: str) -> Curve | None:
 
 
 def smoothed(values: Numbers, share: float) -> Numbers:
-    """Return the centered running mean over a share of all values. The window shrinks at both ends to stay centered."""
+    """Return the centered running mean of values over a window.
+
+    ``share`` is the width of the window as a share of all values. Near both ends, the window is narrower so that it
+    stays centered.
+    """
     half = int(len(values) * share / 2)
     index = np.arange(len(values))
     reach = np.minimum(half, np.minimum(index, len(values) - 1 - index))
@@ -163,7 +171,7 @@ def smoothed(values: Numbers, share: float) -> Numbers:
 
 
 def curves_svg(curves: Sequence[Curve], axis: str) -> str:
-    """Return an SVG element with PSNR over ``axis``, "steps" or "seconds", in the colors of the surrounding page."""
+    """Draw PSNR over ``axis`` ("steps" or "seconds") as an SVG element in the colors of the surrounding page."""
     series = [
         Series(c.name, [(x, y, "") for x, y in zip(getattr(c, axis), c.psnr, strict=True)]) for c in curves
     ]
@@ -172,7 +180,7 @@ def curves_svg(curves: Sequence[Curve], axis: str) -> str:
 
 
 def read_study(scene: Path) -> tuple[str, float] | None:
-    """Read the studied parameter and its value from ``scene.json``; None without one."""
+    """Read the name and the value of the studied parameter from ``scene.json``. Return None if there is none."""
     try:
         study = json.loads((scene / "scene.json").read_text(encoding="utf-8"))["study"]
         return str(study["parameter"]), float(study["value"])
@@ -181,15 +189,15 @@ def read_study(scene: Path) -> tuple[str, float] | None:
 
 
 def study_svg(results: Results, studies: Mapping[str, tuple[str, float] | None]) -> str | None:
-    """Return a chart of the scores of each recipe over the studied parameter.
+    """Draw the scores of each recipe over the studied parameter.
 
     Args:
         results: the comparison.
         studies: result of ``read_study`` by scene.
 
     Returns:
-        None if the scenes are not a family of ``polarguide synth --sweep``: fewer than two values, or different
-        parameters.
+        The chart, or None if the scenes are not a family of ``polarguide synth --sweep``. A family has one parameter
+        with at least two values.
     """
     values = {scene: study[1] for scene, study in studies.items() if study is not None}
     parameters = {study and study[0] for study in studies.values()}
@@ -205,16 +213,17 @@ def study_svg(results: Results, studies: Mapping[str, tuple[str, float] | None])
 
 
 def exposure_svg(results: Results, pictures: Mapping[tuple[str, str], int]) -> str | None:
-    """Return a chart of all scores: a panel for each metric, a column for each row of the tables, a color by scene.
+    """Draw the scores over the number of pictures.
 
-    Columns are sorted by the number of pictures, then as in the tables.
+    The chart has a panel for each metric, a column for each row of the tables, and a color for each scene. Columns are
+    sorted by the number of pictures, then as in the tables.
 
     Args:
         results: the comparison.
         pictures: number of pictures by scene and row.
 
     Returns:
-        None without scores.
+        The chart, or None if there are no scores.
     """
     numbers = {row: [pictures[scene, row] for scene in results.scenes] for row in results.recipes}
     rows = sorted(numbers, key=lambda row: max(numbers[row]))
@@ -237,14 +246,14 @@ def _score_panels(
     point: Callable[[str, str], tuple[str, float, str]],
     columns: Sequence[list[str]] = (),
 ) -> list[Panel]:
-    """Return a panel for each metric with scores.
+    """Create a panel for each metric that has scores.
 
     Args:
         results: the comparison.
         keys: keys of the metrics.
         axis: label of the x axis.
         names: names of the series.
-        point: returns the series, x and text of a scene and a recipe.
+        point: function that returns the series, the x position and the tooltip of a scene and a recipe.
         columns: see ``panel``.
     """
     panels = []
@@ -261,11 +270,14 @@ def _score_panels(
 
 
 SIDES = (1600, 1200, 800, 600, 400, 300, 200)
-"""Candidates for the longest side of a view in pixels, to fit its share of the file."""
+"""Candidates for the longest side of a picture, in pixels. The largest one that fits the size limit is used."""
 
 
 class Tile(NamedTuple):
-    """Pictures of a view by a method or of the ground truth: a picture and a line of scores for each layer."""
+    """Group of pictures in the report: layers of one view, from one method or from the ground truth.
+
+    Each layer has a picture and a line of scores.
+    """
 
     name: str
     pictures: Mapping[str, Picture]
@@ -273,14 +285,14 @@ class Tile(NamedTuple):
 
 
 class EmbeddedView(NamedTuple):
-    """A view of a scene with its tiles as data URIs.
+    """View of a scene in the report, with pictures as data URIs.
 
     Attributes:
         scene: name of the scene.
         view: name of the view.
-        width: width of the captured picture, for the shape of the tiles.
-        height: height of the captured picture.
-        tiles: name, layers as data URIs, and lines of scores of each tile.
+        width: width of the captured picture, which defines the aspect ratio of the tiles.
+        height: height of the captured picture, for the same purpose.
+        tiles: name of each tile, its layers as data URIs, and its lines of scores.
     """
 
     scene: str
@@ -291,16 +303,17 @@ class EmbeddedView(NamedTuple):
 
 
 def embed(scene: str, view: str, tiles: Sequence[Tile], limit: int) -> tuple[EmbeddedView | None, str | None]:
-    """Encode a view, with reduced pictures if necessary.
+    """Encode a view for the report, and reduce its pictures if necessary.
 
     Args:
         scene: name of the scene.
         view: name of the view.
-        tiles: at least one, with pictures of the same size.
-        limit: largest size of the data URIs in bytes.
+        tiles: at least one tile. All pictures have the same size.
+        limit: largest total size of the data URIs in bytes.
 
     Returns:
-        The view, or None if it does not fit; and a sentence about a reduction or an omission, or None.
+        Two values. The first is the view, or None if it does not fit into the limit. The second is a sentence if
+        pictures were reduced or omitted, else None.
     """
     height, width = next(iter(tiles[0].pictures.values())).shape[:2]
     longest = max(height, width)
@@ -316,16 +329,16 @@ def embed(scene: str, view: str, tiles: Sequence[Tile], limit: int) -> tuple[Emb
 
 
 def chosen_views(names: Sequence[str], count: int) -> list[str]:
-    """Return at most ``count`` names at equal distances, beginning with the first."""
+    """Return at most ``count`` evenly spaced names, beginning with the first name."""
     count = min(count, len(names))
     return [names[index * len(names) // count] for index in range(count)]
 
 
 REPORT = "report.html"
 ERROR_SHEET = "errors.png"
-"""File of the error maps in a run folder."""
+"""Name of the file with error maps in a run folder."""
 PICTURE_BYTES = 28_000_000
-"""Largest size of all pictures of a report. Browsers and mail programs can still handle the file."""
+"""Largest total size of a report's pictures in bytes, for browsers and mail programs."""
 LAYER_METRICS = {
     "final": "psnr",
     "diffuse": "diffuse_psnr",
@@ -334,17 +347,17 @@ LAYER_METRICS = {
     "error": "psnr",
     "normal_error": "normal_mae_deg",
 }
-"""Metric next to each layer."""
+"""Metric that is shown next to each layer."""
 ERROR_HIGH = 0.25
-"""Mean absolute difference of displayed pictures at the bright end of the error map."""
+"""Mean absolute difference of displayed pictures that is drawn at full brightness in an error map."""
 NORMAL_ERROR_HIGH = 45.0
-"""Angle at the bright end of the map of normal errors, in degrees."""
+"""Angle in degrees that is drawn at full brightness in a map of normal errors."""
 LEGEND = {
     "error": f"mean absolute difference over the channels, 0 to {ERROR_HIGH:g} of white",
     "normal_error": f"angle to the true normal, 0 to {NORMAL_ERROR_HIGH:g} degrees",
     "metalness": "share of metal, 0 to 1",
 }
-"""Meaning of the colors of false-color layers."""
+"""Explanation of the colors of each false-color layer."""
 
 
 def write_report(
@@ -389,7 +402,7 @@ def write_report(
 
 
 def _health(runs: Sequence[PlannedRun]) -> list[str]:
-    """Return a line for each kind of evidence with its runs, and a line for each warning."""
+    """Return a line for each kind of polarization with its runs, and a line for each warning."""
     labels: dict[str, list[str]] = {}
     warnings = []
     for run in runs:
@@ -402,7 +415,7 @@ def _health(runs: Sequence[PlannedRun]) -> list[str]:
 def _scene_views(
     comparison: Comparison, entry: SceneEntry, runs: Sequence[PlannedRun], names: Sequence[str], limit: int
 ) -> Iterator[tuple[EmbeddedView | None, str | None]]:
-    """Yield the result of ``embed`` for views of a scene. The limit is in bytes for each view."""
+    """Yield the result of ``embed`` for each named view of a scene. ``limit`` is the limit of each view in bytes."""
     scene = read_scene(entry.path, comparison.options)
     device = comparison.options.device if comparison.options.local else "auto"
     opened = [open_compared(run.folder, device) for run in runs]
@@ -425,7 +438,7 @@ def _ground_truth_tile(scene: Scene, view: View) -> Tile:
 
 
 def _tile(name: str, run: OpenedRun | FieldRun, view: View, scores: Mapping[str, float | None]) -> Tile:
-    """Return the pictures of a view by a run with their scores."""
+    """Render a view of a run as a tile with scores."""
     result = run.model.render(view.camera, surface=True).to("cpu")
     pictures = {
         layer: picture
@@ -458,14 +471,16 @@ def report_html(
     sheets: Mapping[str, Sequence[tuple[str, str]]] = MappingProxyType({}),
     health: Sequence[str] = (),
 ) -> str:
-    """Return the page as HTML with escaped texts. It loads nothing from outside, but links to ``sheets``.
+    """Return the report as HTML with escaped texts.
+
+    The page is self-contained, except for links to ``sheets``.
 
     Args:
         results: the comparison.
-        views: the pictures.
-        curves: curves of the recipes by scene.
+        views: views with pictures.
+        curves: training curves of the recipes, by scene.
         remarks: sentences about omitted or reduced pictures.
-        sheets: recipes and paths of their error maps by scene, relative to the page.
+        sheets: for each scene, recipes and paths of their error maps, relative to the page.
         health: sentences about the health of the trainings.
     """
     package = "polarguide_bench"
@@ -513,7 +528,7 @@ def _summary(results: Results) -> str:
 
 
 def _without_folders(command: str) -> str:
-    """Return a command with the names of files but without their folders, which are private."""
+    """Return a command line whose paths are shortened to file names, because folders are private."""
     try:
         return shlex.join(Path(word).name if "/" in word else word for word in shlex.split(command))
     except ValueError:  # an edited record
@@ -521,7 +536,7 @@ def _without_folders(command: str) -> str:
 
 
 def _facts(results: Results) -> dict[str, str]:
-    """Return the facts at the end of the report by heading."""
+    """Return the facts that the end of the report lists, by heading."""
     record = results.record
     facts = msgspec.to_builtins(record.provenance) | msgspec.to_builtins(record.settings)
     if facts["refractive_index"] is None:
@@ -537,9 +552,10 @@ def _facts(results: Results) -> dict[str, str]:
 
 
 def recorded_health(run: Path) -> tuple[str | None, tuple[str, ...]]:
-    """Read the polarization and the warnings from a run's ``health.json``; None and no warnings without the file.
+    """Read the kind of polarization and the warnings from a run's ``health.json``.
 
-    An invalid file becomes a warning, so that other runs are still reported.
+    Without the file, return None and no warnings. An invalid file becomes a warning, so that other runs are still
+    reported.
     """
     try:
         health = Health.load(run)

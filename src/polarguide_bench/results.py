@@ -1,6 +1,6 @@
-"""Results of a comparison: the record ``results.json``, data frames and statistics.
+"""Results of a comparison as a record (``results.json``), as data frames, and as statistics.
 
-The statistics are paired differences between recipes with their confidence intervals and their noise.
+The statistics are paired differences between recipes, their confidence intervals, and their noise due to random seeds.
 ``docs/explanation/statistics.md`` contains the formulas and the unit of each interval.
 """
 
@@ -27,24 +27,24 @@ from polarguide.results.evaluation.table import COLUMNS, PART_METRICS, Metric
 
 FORMAT = "polarguide-results-2"
 FORMER = "polarguide-results-1"
-"""Previous format, without objects, materials, black pixels, the reference recipe and differences."""
+"""Name of the previous format, which has no objects, materials, black pixels, reference recipe and differences."""
 REMEDY = "Give the command again to write a new record."
 _Item = TypeVar("_Item")
 _Filled = Annotated[list[_Item], Meta(min_length=1)]
 Count = Annotated[int, Meta(ge=0)]
 Scores = dict[str, float | None]
-"""Metrics by key; None if the recipe or the ground truth gives no value."""
+"""Value of each metric by key, or None if the recipe or the ground truth provides no value."""
 
 
 class Provenance(msgspec.Struct):
-    """Origin of a record.
+    """Provenance of a record.
 
     Attributes:
         version: version of polarguide.
-        commit: commit of its source, if known.
-        sources: digest of the code that trains and scores.
-        command: command line.
-        date: ISO 8601, UTC.
+        commit: commit of the source code, if known.
+        sources: digest of the code for training and scoring.
+        command: command line of the comparison.
+        date: date and time in UTC, ISO 8601.
     """
 
     version: str
@@ -55,16 +55,17 @@ class Provenance(msgspec.Struct):
 
 
 class Settings(msgspec.Struct):
-    """Settings of all runs of a comparison. The defaults of the last fields hold for records that lack them.
+    """Settings of all runs of a comparison. Old records lack the last fields, which then have their default values.
 
     Attributes:
         steps: training steps.
         seeds: number of seeds.
         downscale: factor by which pictures are reduced.
         transfer: transfer function of the pictures.
-        refractive_index: index of all scenes; None if each scene has its own. Earlier records contain 0 instead.
+        refractive_index: refractive index of all scenes, or None if each scene has its own. Earlier records contain 0
+            instead.
         threads: threads of each run.
-        jobs: number of simultaneous runs; 0 if it was automatic.
+        jobs: number of simultaneous runs. 0 means that it was chosen automatically.
         against: reference recipe of the differences.
         background: kind of background.
         materials: kinds of materials.
@@ -87,16 +88,17 @@ class Settings(msgspec.Struct):
 
 
 class SceneRecord(msgspec.Struct):
-    """A scene of a comparison.
+    """Record of a scene in a comparison.
 
     Attributes:
-        name: name of its folder.
-        digest: digest of its files.
+        name: name of the scene folder.
+        digest: digest of the files of the scene.
         views: number of views.
-        test_views: names of the test views. Scores are means over them.
+        test_views: names of the test views, over which scores are averaged.
         black_share: share of black pixels in the first test view, if known.
-        warnings: limits of the scores because of missing ground truth. Absent without warnings.
-        refractive_index: index of its runs. Present only if ``Settings`` contains None.
+        warnings: sentences about scores that are limited because ground truth is missing. The field is absent without
+            warnings.
+        refractive_index: refractive index of the scene's runs. The field is present only if ``Settings`` contains None.
     """
 
     name: str
@@ -109,7 +111,7 @@ class SceneRecord(msgspec.Struct):
 
 
 class RecipeRecord(msgspec.Struct):
-    """A recipe with all its values. ``steps`` is present only if it differs from ``Settings``."""
+    """Record of a recipe with all its values. ``steps`` is present only if it differs from ``Settings``."""
 
     name: str
     about: str
@@ -121,7 +123,7 @@ class PartScores(msgspec.Struct):
     """Scores of a run on an object, or on all objects of a material.
 
     Attributes:
-        material: class of the material, if known.
+        material: class of the object's material, if known.
         pixels: number of pixels in all test views.
         views: number of test views that show the part.
         metrics: the scores.
@@ -134,7 +136,7 @@ class PartScores(msgspec.Struct):
 
 
 class RunRecord(msgspec.Struct, kw_only=True):
-    """A training with its state and scores.
+    """Record of a run: its training, state and scores.
 
     Attributes:
         scene: name of the scene.
@@ -142,10 +144,10 @@ class RunRecord(msgspec.Struct, kw_only=True):
         seed: seed of the training.
         folder: run folder, relative to the record.
         state: "done", "failed" or "missing".
-        error: reason of a failure.
-        metrics: scores of a finished run, else None.
-        lpips_reason: reason for a missing LPIPS.
-        mesh_reason: reason for missing scores of the mesh. Earlier records lack it.
+        error: reason of a failure, if any.
+        metrics: scores of a finished run, or None.
+        lpips_reason: reason why LPIPS is missing, if any.
+        mesh_reason: reason why the scores of the mesh are missing, if any. Earlier records lack this field.
         views: scores by test view.
         objects: scores by object; empty if the scene has no table of objects.
         materials: scores by class of material; empty if the scene has no table of objects.
@@ -166,10 +168,10 @@ class RunRecord(msgspec.Struct, kw_only=True):
 
 
 class Record(msgspec.Struct):
-    """A comparison: its request, and the scores of each run. Tables and differences are computed from it.
+    """Record of a comparison: its settings, and the scores of each run. Tables and differences are computed from it.
 
     Raises:
-        PolarguideError: a duplicate name, or a run of an unknown scene or recipe.
+        PolarguideError: a name occurs twice, or a run has an unknown scene or recipe.
     """
 
     format: str
@@ -205,7 +207,7 @@ class Record(msgspec.Struct):
 
 
 def read_results(path: Path) -> Record:
-    """Read a ``results.json`` of this format or the previous one.
+    """Read a ``results.json`` in the current or the previous format.
 
     Raises:
         PolarguideError: the file is missing or invalid. The message names the key.
@@ -220,11 +222,11 @@ def _require_one_of(where: str, value: str | None, allowed: Sequence[str | None]
 
 Numbers = NDArray[np.float64]
 Values = dict[str, Numbers]
-"""A metric by scene: [recipes, seeds, units], NaN for a missing value. Units are test views, or one for a whole run."""
+"""Values of a metric by scene: [recipes, seeds, units], NaN if missing. A unit is a test view, or the whole run."""
 
 CONFIDENCE = 0.95
 LEAST_UNITS = 3
-"""Fewest seeds, views or scenes for an interval. The interval of two is 13 times as wide as their difference."""
+"""Minimum number of seeds, views or scenes for a confidence interval. With two, the interval is uselessly wide."""
 NORMAL_QUANTILE = float(stats.norm.ppf((1 + CONFIDENCE) / 2))
 KNOWN_SCATTER: Mapping[str, float] = {
     "psnr": 0.23,
@@ -242,15 +244,17 @@ KNOWN_SCATTER: Mapping[str, float] = {
 
 ``docs/explanation/statistics.md`` describes its origin."""
 KNOWN_SCATTER_ON_BLACK: Mapping[str, float] = {**KNOWN_SCATTER, "psnr": 1.5}
-"""Known scatter on a black background. There, fog dominates the error of the picture and depends on the seed."""
+"""Known scatter for pictures with a black background. Faint haze, which depends on the seed, dominates their error."""
 BLACK_SHARE = 0.25
-"""Share of black pixels above which a background is black."""
+"""Share of black pixels above which a picture has a black background."""
 CONTROL = "unpolarized"
-"""Variation of a control: ``R:unpolarized`` and ``R:unpolarized-...`` are the recipe ``R`` without polarization."""
+"""Name of the variation without polarization, which is the control of a recipe ``R``.
+
+``R:unpolarized`` and ``R:unpolarized-...`` are such controls."""
 
 
 def controlled(recipes: Sequence[str]) -> dict[str, list[str]]:
-    """Return the controls of each recipe that has controls."""
+    """Return the controls of each recipe, without recipes that have no control."""
     by_recipe = {
         recipe: [name for name in recipes if f"{name}-".startswith(f"{recipe}:{CONTROL}-")]
         for recipe in recipes
@@ -259,7 +263,10 @@ def controlled(recipes: Sequence[str]) -> dict[str, list[str]]:
 
 
 def known_scatter(key: str, black_share: float | None) -> float | None:
-    """Return the known scatter of a metric on a scene with a share of black pixels, which is small if unknown."""
+    """Return the known scatter of a metric on a scene, which depends on the scene's share of black pixels.
+
+    If the share is unknown, it is assumed to be small.
+    """
     black = black_share is not None and black_share >= BLACK_SHARE
     return (KNOWN_SCATTER_ON_BLACK if black else KNOWN_SCATTER).get(key)
 
@@ -267,11 +274,11 @@ def known_scatter(key: str, black_share: float | None) -> float | None:
 def values_of(
     record: Record, value: Callable[[RunRecord], Mapping[str, float | None]], scenes: Iterable[str] = ()
 ) -> Values:
-    """Return values of all runs by scene. Scenes without values are left out.
+    """Collect values of all runs by scene. Scenes without values are left out.
 
     Args:
         record: the record.
-        value: returns the values of a run by unit.
+        value: function that returns the values of a run by unit.
         scenes: names of the scenes; all if empty.
     """
     recipes = {recipe.name: index for index, recipe in enumerate(record.recipes)}
@@ -294,20 +301,24 @@ def metric_of_runs(key: str) -> Callable[[RunRecord], dict[str, float | None]]:
 
 
 def metric_of_views(metric: Metric) -> Callable[[RunRecord], dict[str, float | None]]:
-    """Return a function for ``values_of`` that reads a metric of each test view, or of a run if it has no views."""
+    """Return a function for ``values_of`` that reads a metric of each test view.
+
+    If a run records no views, the function reads the metric of the whole run.
+    """
     if metric.of == "run":
         return metric_of_runs(metric.key)
     return lambda run: {view: scores.get(metric.key) for view, scores in run.views.items()}
 
 
 def shared(values: Numbers) -> Numbers:
-    """Return the values that several recipes share: units that all of them have with each shared seed.
+    """Restrict values of several recipes to seeds and units that all recipes have.
 
     Args:
         values: [recipes, seeds, units].
 
     Returns:
-        [recipes, seeds, shared units]. Rows of other seeds are NaN. There are no units without a shared seed.
+        [recipes, seeds, shared units]. The values are NaN at a unit and seed that a recipe lacks. Without a shared
+        seed, there are no shared units.
     """
     present = ~np.asarray(np.isnan(values).any(axis=0))
     seeds = present.any(axis=1)
@@ -316,7 +327,7 @@ def shared(values: Numbers) -> Numbers:
 
 
 def paired(of: Numbers, other: Numbers) -> Numbers:
-    """Return the differences ``of - other`` [seeds, units] at the seeds and units that both have; see ``shared``."""
+    """Return differences ``of - other`` [seeds, units] at the seeds and units that both recipes have (``shared``)."""
     return np.asarray(np.subtract(*shared(np.stack([of, other]))))
 
 
@@ -326,17 +337,17 @@ def known(values: Numbers) -> list[float]:
 
 
 def seed_means(differences: Iterable[Numbers]) -> Numbers:
-    """Return means over units [scenes, seeds] of differences of several scenes; NaN for a seed without a pair."""
+    """Average the differences of each scene over units, [scenes, seeds]. The mean is NaN for a seed without a pair."""
     return np.array([[fmean(known(row)) if known(row) else np.nan for row in d] for d in differences])
 
 
 def _means_by_seed(by_seed: Numbers) -> list[float]:
-    """Return means over scenes of values [scenes, seeds], for each seed that all scenes have."""
+    """Average values [scenes, seeds] over scenes, for each seed that all scenes have."""
     return [fmean(column) for column in by_seed.T.tolist() if not any(map(math.isnan, column))]
 
 
 def t_half_width(values: Sequence[float]) -> float:
-    """Return half the width of Student's 95 % confidence interval of the mean of independent values, two at least."""
+    """Return half the width of the 95 % confidence interval (Student's t) for the mean of at least two values."""
     quantile = float(stats.t.ppf((1 + CONFIDENCE) / 2, len(values) - 1))
     return quantile * (stdev(values) / math.sqrt(len(values)))
 
@@ -344,18 +355,20 @@ def t_half_width(values: Sequence[float]) -> float:
 def estimate(differences: Sequence[Numbers], scatter: Sequence[float | None]) -> dict[str, Any]:
     """Return the mean of paired differences with its confidence interval and noise.
 
-    The interval is over scenes if there are at least three. Otherwise it is over seeds, if each scene has at least
-    three pairs. Otherwise, for one scene, it is over test views and holds for these trainings only. The difference
-    may be noise if its interval contains 0. An interval over views is also compared with the known scatter of seeds.
+    With at least three scenes, the interval describes the variation between scenes. With fewer scenes, it describes the
+    variation between seeds if each scene has at least three pairs. Otherwise, for a single scene, it describes the
+    variation between test views and is valid only for these trainings. The difference may be noise if its interval
+    contains 0. With an interval over views, the difference is also compared with the known scatter of seeds.
 
     Args:
         differences: result of ``paired`` for each scene, not empty.
         scatter: known scatter on each scene.
 
     Returns:
-        ``mean``; ``low`` and ``high``, the 95 % confidence interval or None; ``over``, the unit of the interval or
-        None; ``count``, the number of units; ``seeds``, the smallest number of paired seeds of a scene; ``noise``,
-        None if unknown.
+        A dictionary with these keys. ``mean`` is the mean difference. ``low`` and ``high`` are the ends of the 95 %
+        confidence interval, or None. ``over`` is the unit of the interval, or None. ``count`` is the number of units.
+        ``seeds`` is the smallest number of paired seeds of a scene. ``noise`` is True if the difference may be noise,
+        or None if this is unknown.
     """
     by_seed = seed_means(differences)
     means = [fmean(known(row)) for row in by_seed]
@@ -378,15 +391,15 @@ def estimate(differences: Sequence[Numbers], scatter: Sequence[float | None]) ->
 
 
 def training_noise(by_seed: Numbers, scatter: Sequence[float | None]) -> float | None:
-    """Return the largest mean difference between two recipes that chance explains, at the same seeds and scenes.
+    """Return the largest mean difference between two equally good recipes that random seeds can cause.
 
     Args:
         by_seed: differences [scenes, seeds], NaN for a seed without a pair. Each scene has at least one pair.
         scatter: known scatter on each scene.
 
     Returns:
-        Half the width of the 95 % confidence interval over seeds. It is computed from the seeds if all scenes share at
-        least three, otherwise from the known scatter. None if a scatter is unknown.
+        Half the width of the 95 % confidence interval over seeds. If all scenes share at least three seeds, it is
+        computed from them, otherwise from the known scatter. None if a known scatter is needed but missing.
     """
     values = _means_by_seed(by_seed)
     if len(values) >= LEAST_UNITS:
@@ -398,7 +411,7 @@ def training_noise(by_seed: Numbers, scatter: Sequence[float | None]) -> float |
 
 
 def is_noise(by_seed: Numbers, scatter: Sequence[float | None]) -> bool | None:
-    """Return True if a difference is within ``training_noise``; None if that is unknown."""
+    """Return True if a difference is at most ``training_noise``, or None if that noise is unknown."""
     half = training_noise(by_seed, scatter)
     return None if half is None else abs(fmean(fmean(known(row)) for row in by_seed)) <= half
 
@@ -412,19 +425,21 @@ def pair(
     *,
     scatter: bool = True,
 ) -> dict[str, Any] | None:
-    """Compare a recipe with the best of other recipes. The best is chosen at the seeds and units that all share.
+    """Compare a recipe with the best of other recipes.
+
+    The best recipe is chosen from values at seeds and units that all recipes have.
 
     Args:
         record: the record.
-        values: values of the metric on each scene that counts.
+        values: values of the metric on each scene to compare.
         recipe: name of the recipe.
-        others: names of the candidates. The first of equal ones is chosen.
-        column: the metric. It has a better side.
-        scatter: True if the known scatter holds for these values.
+        others: names of the other recipes. If several are equally good, the first is chosen.
+        column: the metric, whose better direction is known.
+        scatter: True if the known scatter is valid for these values.
 
     Returns:
-        The result of ``estimate`` with ``other``, the chosen recipe, and ``left_out``, candidates without pairs. None
-        if there are no pairs, or no values that all candidates share.
+        The result of ``estimate`` with two more keys: ``other`` is the chosen recipe, and ``left_out`` lists recipes
+        without pairs. None if there are no pairs, or no seeds and units that all recipes have.
     """
     index = {entry.name: number for number, entry in enumerate(record.recipes)}
     pairs = {o: [paired(v[index[recipe]], v[index[o]]) for v in values.values()] for o in others}
@@ -445,7 +460,7 @@ def pair(
 
 
 def scatter_on(record: Record, scenes: Iterable[str], column: Metric) -> list[float | None]:
-    """Return the known scatter of a metric on each of several scenes."""
+    """Return the known scatter of a metric on each scene."""
     black = {scene.name: scene.black_share for scene in record.scenes}
     return [known_scatter(column.key, black[scene]) for scene in scenes]
 
@@ -453,9 +468,10 @@ def scatter_on(record: Record, scenes: Iterable[str], column: Metric) -> list[fl
 def told_apart(
     values: Values, best: int, other: int, sign: float, scatter: Sequence[float | None]
 ) -> bool | None:
-    """Return True if one recipe leads another beyond noise, at the seeds that both have on each scene.
+    """Return True if one recipe is better than another by more than noise.
 
-    None if there is no test: no paired seeds, or too few without a known scatter.
+    The test uses the seeds that both recipes have on each scene. Return None if no test is possible. This is the case
+    without paired seeds, or if they are too few and the known scatter is missing.
     """
     present = {scene: v for scene, v in values.items() if not np.isnan(v[[best, other]]).all()}
     leads = [sign * paired(v[best], v[other]) for v in present.values()]
@@ -467,9 +483,9 @@ def told_apart(
 
 
 def differences(record: Record, compared: Sequence[Metric]) -> list[dict[str, Any]]:
-    """Return all differences of finished runs, scene by scene, then over scenes.
+    """Return all differences between recipes: first for each scene, then over all scenes.
 
-    A difference over scenes requires pairs of both recipes on each scene on which any recipe has a value.
+    A difference over scenes needs pairs of both recipes on each scene on which at least one recipe has a value.
     ``docs/reference/formats.md`` describes the fields.
     """
     recipes = [recipe.name for recipe in record.recipes]
@@ -492,7 +508,7 @@ def differences(record: Record, compared: Sequence[Metric]) -> list[dict[str, An
 
 
 COMPARED = tuple(column for column in COLUMNS if column.better is not None and not column.timed)
-"""Metrics with differences: they have a better side and do not depend on the machine."""
+"""Metrics whose differences are computed. Their better direction is known, and they do not depend on the machine."""
 DIFFERENCE_FIELDS = (
     "scene", "recipe", "other", "why", "metric", "mean", "low", "high", "over", "count", "seeds", "noise",
 )  # fmt: skip
@@ -500,11 +516,11 @@ DIFFERENCE_FIELDS = (
 
 @dataclass(frozen=True)
 class Cell:
-    """A metric of a recipe on a scene.
+    """Statistics of one metric for a recipe on a scene.
 
     Attributes:
         mean: mean over seeds.
-        spread: sample standard deviation over seeds; None for one seed.
+        spread: sample standard deviation over seeds, or None for one seed.
         count: number of seeds.
     """
 
@@ -521,13 +537,13 @@ def cell_of(values: Sequence[float | None]) -> Cell:
 
 
 class ScoreRow(NamedTuple):
-    """A recipe on a scene, or its mean over scenes.
+    """Row of the scores: a recipe on a scene, or the mean of a recipe over scenes.
 
     Attributes:
-        scene: name of the scene; None for the mean over scenes.
+        scene: name of the scene, or None for the mean over scenes.
         recipe: name of the recipe.
         finished: number of finished runs.
-        cells: cells by metric.
+        cells: statistics of each metric, by key.
     """
 
     scene: str | None
@@ -538,10 +554,10 @@ class ScoreRow(NamedTuple):
 
 @dataclass(frozen=True)
 class Results:
-    """Results of a comparison. A missing value in a data frame is NaN or None.
+    """Results of a comparison as data frames, in which a missing value is NaN or None.
 
     Attributes:
-        record: content of ``results.json`` without the tables, which are computed from it.
+        record: content of ``results.json``, from which all tables are computed.
     """
 
     record: Record
@@ -558,26 +574,35 @@ class Results:
 
     @cached_property
     def runs(self) -> pd.DataFrame:
-        """A row for each run: scene, recipe, seed, state (done, failed, missing), error, folder, and each metric."""
+        """Data frame with a row for each run.
+
+        Its columns are scene, recipe, seed, state (done, failed, missing), error, folder, and each metric.
+        """
         named = ("scene", "recipe", "seed", "state", "error", "folder")
         rows = [{k: getattr(run, k) for k in named} | (run.metrics or {}) for run in self.record.runs]
         return _frame(rows, named, [column.key for column in COLUMNS])
 
     @cached_property
     def scores(self) -> pd.DataFrame:
-        """A row for each scene (None: mean over scenes) and recipe: finished ``runs``, metrics and their spreads."""
+        """Data frame with a row for each recipe on each scene, and for its mean over scenes (scene None).
+
+        Its columns are scene, recipe, the number of finished ``runs``, and each metric with its spread.
+        """
         rows = [[row.scene, row.recipe, row.finished, *_numbers(row.cells.values())] for row in self.table]
         return _frame(rows, ("scene", "recipe", "runs"), _with_spreads(COLUMNS))
 
     @cached_property
     def differences(self) -> pd.DataFrame:
-        """Paired differences ``recipe - other`` in a metric with interval and noise. Scene None: over scenes."""
+        """Data frame of paired differences ``recipe - other`` in each metric, with confidence interval and noise.
+
+        In rows of differences over all scenes, the scene is None.
+        """
         frame = pd.DataFrame(self.compared, columns=[*DIFFERENCE_FIELDS])
         return frame.astype({"mean": float, "low": float, "high": float})
 
     @cached_property
     def parts(self) -> pd.DataFrame:
-        """Scores by object and by material of each scene and recipe: means over seeds with their spreads."""
+        """Data frame of scores by object and by material: means over seeds and their spreads."""
         scores: dict[tuple[str, ...], list[PartScores]] = {}
         for run in self.record.runs:
             for kind, scored in (("object", run.objects), ("material", run.materials)):
@@ -594,15 +619,15 @@ class Results:
 
     @cached_property
     def compared(self) -> list[dict[str, Any]]:
-        """Differences in the format of ``results.json``."""
+        """Differences between recipes in the format of ``results.json``."""
         return differences(self.record, COMPARED)
 
     @cached_property
     def table(self) -> list[ScoreRow]:
-        """A row for each scene and recipe. With several scenes, also a row for the mean over scenes of each recipe.
+        """Rows of the scores: one for each recipe on each scene and, with several scenes, one for each recipe's mean.
 
-        Each scene has the same weight in that mean. A recipe has a mean only if it has a value on each scene on which
-        any recipe has one, because means over different scenes are not comparable.
+        Each scene has the same weight in the mean. A recipe has a mean only if it has a value on each scene on which at
+        least one recipe has a value, because means over different scenes are not comparable.
         """
         values = {column.key: values_of(self.record, metric_of_runs(column.key)) for column in COLUMNS}
         rows = []
@@ -619,7 +644,7 @@ class Results:
 
 
 def _over_scenes(numbers: Sequence[Any]) -> Cell:
-    """Return the mean over scenes of a recipe's values by seed; an empty cell if a scene has no value."""
+    """Average a recipe's values by seed over scenes. The cell is empty if a scene has no value."""
     if not numbers or not all(known(seeds) for seeds in numbers):
         return Cell()
     complete = [fmean(seeds) for seeds in np.transpose(numbers).tolist() if not np.isnan(seeds).any()]
@@ -635,5 +660,5 @@ def _with_spreads(columns: Sequence[Metric]) -> list[str]:
 
 
 def _numbers(cells: Iterable[Cell]) -> Iterator[float | None]:
-    """Return the mean and the spread of each cell in turn."""
+    """Yield the mean and the spread of each cell, one after the other."""
     return (value for cell in cells for value in (cell.mean, cell.spread))

@@ -1,4 +1,4 @@
-"""Tables of a comparison, and their files: Markdown, LaTeX, CSV and the record."""
+"""Tables of a comparison, and their output as Markdown, LaTeX, CSV and JSON."""
 
 from __future__ import annotations
 
@@ -64,24 +64,24 @@ _BOLD_NOTE = (
 
 
 TableCell = tuple[str, str, bool]
-"""A value, its spread or interval (may be empty), and True for bold."""
+"""Cell of a table: a value, its spread or interval (may be empty), and True for bold type."""
 Label = tuple[str, bool, str]
-"""Label of a row: a name, True for a name of code (a recipe), and a remark (may be empty)."""
+"""Label of a row: a name, True if the name is set as code (a recipe), and a remark (may be empty)."""
 TableRow = tuple[list[Label], list[TableCell]]
-"""Labels and cells of a row, as many as its section has."""
+"""Row of a table: its labels and its cells, one for each column of the section."""
 EMPTY: TableCell = ("", "", False)
 
 
 class Section(NamedTuple):
-    """Blocks with the same columns.
+    """Table with one or several blocks of rows that have the same columns.
 
     Attributes:
-        key: name for links.
-        title: heading; empty for the scores, which come first.
-        labels: headings of the labels.
-        headings: headings of the cells.
-        blocks: titles and rows.
-        notes: notes for the reader, a sentence each.
+        key: name of the section in links.
+        title: heading. It is empty for the scores, which are the first section.
+        labels: headings of the columns with labels.
+        headings: headings of the columns with values.
+        blocks: title and rows of each block.
+        notes: sentences that explain the table.
     """
 
     key: str
@@ -93,18 +93,18 @@ class Section(NamedTuple):
 
 
 def formatted(value: float | None, column: Metric) -> str:
-    """Return a recorded value with the digits of tables and without its unit; empty for None."""
+    """Format a recorded value for a table, without its unit. None becomes an empty text."""
     return "" if value is None else f"{value * column.factor:,.{column.digits}f}"
 
 
 def signed(value: float, column: Metric) -> str:
-    """Return a difference of recorded values with its sign: a true minus sign, and never a negative zero."""
+    """Format a difference with a plus or minus sign. Zero has no minus sign."""
     text = f"{round(value * column.factor, column.digits) + 0.0:+,.{column.digits}f}"
     return text.replace("-", MINUS)
 
 
 def sections(results: Results) -> list[Section]:
-    """Return all tables of a comparison that have rows, in their order."""
+    """Return all tables of a comparison that have rows, in the order of display."""
     tables = (
         scores_section(results),
         control_section(results),
@@ -116,7 +116,7 @@ def sections(results: Results) -> list[Section]:
 
 
 def scores_section(results: Results) -> Section:
-    """Return the scores by scene of each metric with a value. The leaders of each column are bold."""
+    """Return the table of scores by scene for all metrics with values. Leading values of each column are bold."""
     columns = [
         c for c in COLUMNS if c.shown == "tables" and any(row.cells[c.key].count for row in results.table)
     ]
@@ -143,14 +143,14 @@ def scores_section(results: Results) -> Section:
 def leaders(
     means: Mapping[int, float], values: Values, column: Metric, scatter: Sequence[float | None]
 ) -> set[int]:
-    """Return the recipes with the best mean of a metric, and those that the test cannot distinguish from the best.
+    """Return the recipes with the best mean of a metric, and all recipes that are not significantly worse.
 
-    The test compares differences at the same seeds with ``training_noise``. There are no leaders if it distinguishes no
-    recipe from the best, or if the metric has no better side.
+    The test compares differences at the same seeds with ``training_noise``. The set is empty if no recipe is
+    significantly worse than the best, or if the metric has no better direction.
 
     Args:
-        means: displayed values by the index of the recipe.
-        values: values of the runs.
+        means: displayed values by index of the recipe.
+        values: values of all runs.
         column: the metric.
         scatter: known scatter on each scene of the values.
     """
@@ -166,7 +166,7 @@ def leaders(
 
 
 def score_cell(row: ScoreRow, column: Metric, bold: bool, results: Results) -> TableCell:
-    """Return the cell of a recipe's score on a scene."""
+    """Format the score of a recipe on a scene as a cell."""
     cell = row.cells[column.key]
     if cell.mean is None:
         # A speed without its own measurement, or an unfinished run, is not "not applicable".
@@ -178,12 +178,12 @@ def score_cell(row: ScoreRow, column: Metric, bold: bool, results: Results) -> T
 
 
 def seed_counts(results: Results) -> list[int]:
-    """Return the different numbers of requested seeds of all recipes and scenes, ascending."""
+    """Return all numbers of seeds that occur for recipes and scenes, without repetition and in ascending order."""
     return sorted(set(Counter((run.scene, run.recipe) for run in results.record.runs).values()))
 
 
 def _remark(row: ScoreRow, results: Results) -> str:
-    """Return a recipe's own number of steps, and its missing runs or its number of seeds if rows differ."""
+    """Return the remark of a row: a different number of steps, missing runs, or a different number of seeds."""
     (steps,) = (recipe.steps for recipe in results.record.recipes if recipe.name == row.recipe)
     states = [r.state for r in results.record.runs if r.recipe == row.recipe and row.scene in (None, r.scene)]
     finished = states.count("done")
@@ -198,7 +198,7 @@ def _remark(row: ScoreRow, results: Results) -> str:
 
 
 def notes(results: Results) -> list[str]:
-    """Return notes on the scores for the reader, a sentence each."""
+    """Return sentences that explain the scores."""
     counts = seed_counts(results)
     record = results.record
     number = f"{counts[0]} " if len(counts) == 1 else ""
@@ -227,7 +227,10 @@ def notes(results: Results) -> list[str]:
 
 
 def control_section(results: Results) -> Section:
-    """Return the gain by polarization: a block for each recipe with controls, a row for each scene and over scenes."""
+    """Return the table of gains by polarization: differences between recipes and their controls.
+
+    It has a block for each recipe with controls, and a row for each scene and for the mean over scenes.
+    """
     compared = [d for d in results.compared if d["why"] == "control"]
     columns = _columns(compared)
     blocks = []
@@ -262,7 +265,7 @@ def control_section(results: Results) -> Section:
 
 
 def against_section(results: Results) -> Section:
-    """Return differences to a reference recipe: a block for each scene, a row for each other recipe."""
+    """Return the table of differences to a reference recipe, with a block per scene and a row per other recipe."""
     against = results.record.settings.against
     compared = [d for d in results.compared if d["why"] == "against"]
     columns = _columns(compared)
@@ -300,7 +303,10 @@ def _row(
     columns: Sequence[Metric],
     letters: Mapping[str, str],
 ) -> TableRow:
-    """Return the differences of one row. The label has the most frequent unit of intervals; cells have other units."""
+    """Return a row of differences.
+
+    The label states the unit of most of the intervals. A cell states its unit if it differs.
+    """
     by_key = {difference["metric"]: difference for difference in compared}
     units = {key: _unit(difference) for key, difference in by_key.items()}
     shown = [units[column.key] for column in columns if column.key in units]
@@ -319,7 +325,7 @@ def _row(
 
 
 def _unit(difference: Mapping[str, Any]) -> str:
-    """Return the unit of the interval; without an interval, the number of seeds."""
+    """Return the unit of a difference's interval, or the number of seeds if there is no interval."""
     seeds = f"{difference['seeds']} seed{'' if difference['seeds'] == 1 else 's'}"
     if difference["over"] is None:
         return f"none, {seeds}"
@@ -329,7 +335,11 @@ def _unit(difference: Mapping[str, Any]) -> str:
 
 
 def _gain(difference: Mapping[str, Any] | None, column: Metric, more: str = "") -> TableCell:
-    """Return a difference with the mark of its noise: ≈ within noise, ? unknown noise, bold for better beyond noise."""
+    """Format a difference as a cell that shows its noise.
+
+    The mark ≈ means that the difference is within noise, and ? that the noise is unknown. Bold type means better beyond
+    noise.
+    """
     if difference is None:
         return EMPTY
     value = difference["mean"]
@@ -339,7 +349,10 @@ def _gain(difference: Mapping[str, Any] | None, column: Metric, more: str = "") 
 
 
 def part_section(results: Results, kind: str) -> Section:
-    """Return scores by part: a block for each metric, a row for each object of each scene, or for each material."""
+    """Return the table of scores by object or by material, as ``kind`` selects.
+
+    It has a block for each metric, and a row for each object of each scene, or for each material.
+    """
     with_controls = controlled(results.recipes)
     places: dict[tuple[str, ...], dict[str, None]] = {}  # an object or a material -> its scenes
     for scene, run in [(s, run) for s in results.scenes for run in results.record.runs if run.scene == s]:
@@ -381,7 +394,10 @@ def part_section(results: Results, kind: str) -> Section:
 
 
 def _part_score(kind: str, labels: Sequence[str], key: str, run: RunRecord) -> dict[str, float | None]:
-    """Return a metric of an object (scene, name, material) or of a material (name), for ``values_of``."""
+    """Read a metric of an object or a material from a run, for ``values_of``.
+
+    The labels of an object are scene, name and material. The label of a material is its name.
+    """
     part = run.objects.get(labels[1]) if kind == "object" else run.materials.get(labels[0])
     if part is None or (kind == "object" and (part.material or "") != labels[2]):
         return {}
@@ -389,7 +405,7 @@ def _part_score(kind: str, labels: Sequence[str], key: str, run: RunRecord) -> d
 
 
 def _means(values: Values, column: Metric) -> list[TableCell]:
-    """Return a cell for each recipe; empty if it lacks a scene that another recipe has."""
+    """Return the mean of each recipe as a cell. It is empty if the recipe lacks a scene that another recipe has."""
     recipes = np.transpose([seed_means(v) for v in values.values()], (1, 0, 2))  # [recipes, scenes, seeds]
     means = {
         index: fmean(fmean(known(seeds)) for seeds in of)
@@ -421,12 +437,12 @@ _TEXTS = templates("polarguide_bench").overlay(
 
 
 def markdown_text(text: str) -> str:
-    """Escape a text for Markdown, on one line."""
+    """Escape a text for Markdown, and join its lines."""
     return printable(" ".join(text.split())).translate(_MARKDOWN)
 
 
 def latex_text(text: str) -> str:
-    """Escape a text for LaTeX, on one line."""
+    """Escape a text for LaTeX, and join its lines."""
     return printable(" ".join(text.splitlines())).translate(_LATEX)
 
 
@@ -434,7 +450,7 @@ _TEXTS.filters.update(md=markdown_text, tex=latex_text, printable=printable)
 
 
 def write_tables(out: Path, results: Results) -> None:
-    """Write ``results.json``, ``.md``, ``.csv`` and ``.tex``, and differences and parts as CSV, each atomically."""
+    """Write ``results.json``, ``.md``, ``.csv`` and ``.tex``, and CSV files of differences and of scores by part."""
     content = {
         **msgspec.to_builtins(results.record),
         "table": [msgspec.to_builtins(row._asdict()) for row in results.table],
@@ -456,17 +472,19 @@ def write_tables(out: Path, results: Results) -> None:
 
 
 def readable(tables: Sequence[Section], name: str) -> str:
-    """Return tables with their notes in the format of ``results.md`` or ``results.tex``."""
+    """Return tables with their notes as text, in the format of the file ``name``: ``results.md`` or ``results.tex``."""
     return _TEXTS.get_template(name).render(sections=tables)
 
 
 def csv_text(frame: pd.DataFrame) -> str:
-    """Return a frame as CSV in full precision and with the units of tables. Spreadsheets see no formula in it.
+    """Convert a data frame to CSV in full precision, in the units of the tables, and without formulas.
 
-    Metrics whose records have another unit get a key with the unit: ``haze_percent``.
+    If the unit of a metric differs from its recorded unit, the name of the column contains the unit, such as
+    ``haze_percent``.
 
     Args:
-        frame: columns are metrics by key with their ``_spread``; or ``metric`` contains the key of a row.
+        frame: data frame. Either its columns are metrics and their ``_spread``, or the column ``metric`` names the
+            metric of each row.
     """
     frame = frame.copy()
     names = {}

@@ -82,10 +82,13 @@ def compare_recipes(
 
 
 def chosen_steps(values: tuple[str, ...]) -> tuple[int | None, dict[str, int]]:
-    """Parse the common number of steps, None if missing, and the numbers of recipes by name.
+    """Parse numbers of steps.
+
+    Returns:
+        The number for all recipes, or None if it is not specified, and the numbers of individual recipes by name.
 
     Raises:
-        PolarguideError: an invalid or a duplicate value.
+        PolarguideError: a value is invalid, or a recipe occurs twice.
     """
     steps: dict[str, int] = {}
     for value in values:
@@ -106,7 +109,7 @@ def print_results(results: Results, out: Path) -> None:
     """Print the paths of the results.
 
     Raises:
-        PolarguideError: runs have failed.
+        PolarguideError: at least one run has failed.
     """
     say(f"tables: {out}/results.md, .csv, .tex, .json   report: {out}/report.html")
     runs = results.record.runs
@@ -209,9 +212,9 @@ def tables(
 
 
 COLUMNS = ("name", "path", "sensor", "options")
-"""Columns of a table of captures."""
+"""Columns of a CSV file that lists captures."""
 _NAME = re.compile(r"[^\s./\\][^/\\\x00-\x1f]*")
-"""Name that is also valid for a folder."""
+"""Name of a capture that is also valid as the name of a folder."""
 
 
 def batch(
@@ -277,12 +280,12 @@ def batch(
 def _watch(
     look: Callable[[], Sequence[_Line]], process: Callable[[Sequence[_Line]], None], seconds: float
 ) -> None:
-    """Process arriving captures until KeyboardInterrupt. Errors are printed once and do not stop the loop.
+    """Process new captures until KeyboardInterrupt. An error is printed once and does not stop the loop.
 
     Args:
-        look: returns the present captures.
-        process: processes the complete captures. It is called if one of them is new or has changed.
-        seconds: interval.
+        look: function that returns the captures that exist now.
+        process: function that processes the complete captures. It is called if one of them is new or has changed.
+        seconds: interval between two looks.
     """
     say(f"looking for captures every {seconds:g} seconds; Ctrl-C ends it")
     earlier: dict[str, tuple[int, int, int]] = {}
@@ -307,7 +310,7 @@ def _watch(
 
 @dataclass(frozen=True)
 class _Line:
-    """A capture in a collection. ``where`` is its place in messages."""
+    """Capture in a collection. ``where`` names its folder or its line of the CSV file in messages."""
 
     where: str
     name: str
@@ -317,10 +320,10 @@ class _Line:
 
 
 def _lines(collection: Path, out: Path) -> list[_Line]:
-    """Return the captures of a collection in their order.
+    """Return the captures of a collection in the order of the folders or lines.
 
     Raises:
-        PolarguideError: the collection is not a folder of folders or a valid table.
+        PolarguideError: the collection is neither a folder of folders nor a valid CSV file.
     """
     lines = _table(collection) if collection.is_file() else _folders(collection, out)
     places: dict[str, str] = {}
@@ -385,10 +388,10 @@ def _table(file: Path) -> list[_Line]:
 
 
 def _capture(line: _Line, scene: bool, common: str) -> Capture:
-    """Return the capture of a line with its parsed options.
+    """Parse the options of a capture.
 
     Raises:
-        PolarguideError: an unknown option, or an invalid value.
+        PolarguideError: an option is unknown, or a value is invalid.
     """
     words = [*_words(common, "--options"), *(["--sensor", line.sensor] if line.sensor and not scene else ())]
     words += _words(line.options, line.where)
@@ -428,7 +431,7 @@ def _parsed(kind: Callable[..., Any], words: Sequence[str]) -> tuple[Any, list[s
     """Call a function with command-line options, and return its result and the unknown options.
 
     Raises:
-        SystemExit: an invalid value.
+        SystemExit: a value is invalid.
     """
     function = tyro.conf.configure(tyro.conf.OmitArgPrefixes)(kind)
     with contextlib.redirect_stderr(io.StringIO()), contextlib.redirect_stdout(io.StringIO()):

@@ -1,6 +1,7 @@
-"""Child process of a comparison or a batch. It performs the task on its standard input, and stops when that closes.
+"""Child process of a comparison or a batch, which performs the task that it reads from standard input.
 
-The task of a batch is one capture with all its steps: prepare, inspect, train, eval, share and export.
+It stops when standard input closes. The task of a batch is one capture with all its steps: prepare, inspect, train,
+eval, share and export.
 """
 
 from __future__ import annotations
@@ -59,15 +60,15 @@ from polarguide_bench.plan import open_compared
 from polarguide_bench.recipes import recipe_named
 
 THUMBNAIL = 320
-"""Longest side of the pictures on the page of a batch, in pixels."""
+"""Length of the longer side of pictures on the overview page, in pixels."""
 
 
 def process(task: Processing) -> None:
-    """Take the remaining steps of a capture.
+    """Perform the remaining steps of a capture.
 
     Raises:
         PolarguideError: a step failed, or the folder belongs to another request.
-        KeyboardInterrupt: the process was stopped. A training has saved its state; other steps start again.
+        KeyboardInterrupt: the process was stopped. A training has saved its state. Other steps must start again.
     """
     folder = Path(task.folder)
     make_folder(folder)
@@ -156,15 +157,15 @@ _ACTIONS: dict[Step, Callable[[Processing, Path, Path], dict[str, Any] | None]] 
     "share": _share,
     "export": _export,
 }
-"""Function of each step of a capture. It returns fields of the capture's record."""
+"""Function of each step of a capture. It returns new values for fields of the capture's record."""
 
 
 PATIENCE_SECONDS = 120.0
-"""Timeout for a process that has lost its worker. This process resumes from the state that the other one saves."""
+"""Time to wait until a process that has lost its worker saves its state, in seconds. This process then resumes."""
 
 
 def main() -> int:
-    """Perform the task on standard input, stop when that closes, and return the exit status of ``obey``."""
+    """Perform the task on standard input, and return the exit status of ``obey``. Stop if standard input closes."""
     # SIGTERM acts like Ctrl-C, so that open files are closed. Background jobs of a shell ignore Ctrl-C by default.
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, signal.default_int_handler)
@@ -187,9 +188,11 @@ def main() -> int:
 
 
 def obey(line: bytes) -> int:
-    """Perform the task of a message, and return the exit status: 0 done, 130 stopped, 2 invalid input.
+    """Perform the task of a message, and return an exit status.
 
-    Invalid input prints one line. Different code would mix results, so it is invalid input. Comments may differ.
+    The status is 0 if the task is done, 130 if it was stopped, and 2 if the input is invalid. In the last case, one
+    line explains the error. The input is also invalid if the sender runs other code than this process, because results
+    of different code must not be mixed. Comments in the code may differ.
     """
     try:
         message: Any = decode(line, Message, "task")
@@ -245,7 +248,7 @@ def _wait_for_others(run: Path) -> None:
     """Wait until no other process writes to a run.
 
     Raises:
-        PolarguideError: another training does not end.
+        PolarguideError: another process still writes to the run after the timeout.
     """
     end = time.monotonic() + PATIENCE_SECONDS
     while True:

@@ -1,1 +1,1 @@
-"""The Python interface, as ``import polarguide`` offers it: captures, and runs."""
+"""Python interface that ``import polarguide`` provides: functions on captures and on runs."""

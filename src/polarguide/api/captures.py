@@ -1,4 +1,4 @@
-"""Functions of the Python interface on captures; a training does not import them, and begins sooner."""
+"""Functions of the Python interface on captures. They are in a separate module, so that a training starts sooner."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ def inspect(
     device: DeviceName = "auto",
     reporter: Reporter = SILENT,
 ) -> Inspection:
-    """Check a capture; writes a page and a record.
+    """Check a capture, and write a web page and a record of the findings.
 
     Args:
         scene: the scene folder; it may have no poses.
-        out: folder to write; None: SCENE-inspection next to the scene.
+        out: folder to write. None writes to SCENE-inspection next to the scene.
         settings: settings of the inspection.
-        device: device of its short training.
+        device: device of the short training that the inspection includes.
         reporter: receives progress.
 
     Raises:

@@ -1,4 +1,4 @@
-"""Functions of the Python interface on runs. The command line is a client of it.
+"""Functions of the Python interface on runs, which the command line also uses.
 
 Functions here do not print and install no signal handlers: progress and messages go to a ``Reporter``.
 """
@@ -29,13 +29,13 @@ from polarguide.training.settings import TrainSettings
 from polarguide.viewer import server
 
 _PICTURED = 3
-"""Number of rendered views in the representation of a run in a notebook."""
+"""Number of rendered views that a notebook shows for a run."""
 
 
 class Run(OpenedRun):
-    """A trained run: its layers from any camera, and everything that can be made of it.
+    """Trained run, which renders layers from any camera, computes scores, and exports files.
 
-    ``polarguide.train`` and ``polarguide.open_run`` return one.
+    ``polarguide.train`` and ``polarguide.open_run`` return a run.
 
     Example:
         >>> run = polarguide.open_run("runs/demo")                       # doctest: +SKIP
@@ -53,15 +53,15 @@ class Run(OpenedRun):
     write_pictures = pictures.write_pictures
 
     def metrics(self) -> Mapping[str, Any]:
-        """Return the record of ``evaluate``: means over the test views, and ``views`` by name.
+        """Return the scores that ``evaluate`` wrote: means over the test views, and scores by view in ``views``.
 
         Raises:
-            PolarguideError: the run has no scores, or the file is not such a record.
+            PolarguideError: the run has no scores, or the file of scores is invalid.
         """
         return read_metrics(self.folder)
 
     def _repr_html_(self) -> str:
-        """Return rendered held-out views, counts, health and scores, for notebooks."""
+        """Return HTML for notebooks: rendered held-out views, counts, health and scores."""
         facts = {"run": str(self), "polarization": self._evidence()}
         pictures = ""
         try:  # the scene may have moved, and records may be damaged
@@ -102,7 +102,7 @@ def train(
         31.4
 
     Raises:
-        PolarguideError: wrong input, or an unsuitable folder.
+        PolarguideError: the input is invalid, or the folder is not suitable.
         KeyboardInterrupt: the training was stopped. The state is saved, and ``resume=True`` continues to the same
             result.
     """
@@ -131,7 +131,7 @@ def train(
 
 
 def demo_scene() -> Path:
-    """Return the folder of the small scene of the package: glossy objects, 50 views, four angles each.
+    """Return the folder of the small example scene: glossy objects, 50 views, four polarizer angles each.
 
     Example:
         >>> polarguide.load_scene(polarguide.demo_scene()).view("v000").camera.width    # doctest: +SKIP

@@ -1,1 +1,1 @@
-"""Shared by all packages: errors, files, records, options, the machine, progress."""
+"""Code that all packages share: errors, files, records, options, system calls and progress."""

@@ -1,4 +1,4 @@
-"""Errors in the user's input or environment, with a remedy."""
+"""Errors in the user's input or environment, with advice on how to correct them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 
 class PolarguideError(Exception):
-    """Error in input.
+    """Error in the user's input or environment.
 
     The message names the file or field, the expected and the actual value, and a remedy. The command line prints it as
     one line without a traceback.
@@ -42,7 +42,8 @@ def require(condition: object, where: object, *, expected: str, found: str, reme
     """Check a condition on input.
 
     Args:
-        condition: the condition. where, expected, found, remedy: as for ``PolarguideError``.
+        condition: the condition.
+        where, expected, found, remedy: as for ``PolarguideError``.
 
     Raises:
         PolarguideError: the condition does not hold.
@@ -67,7 +68,7 @@ class PolarguideWarning(UserWarning):
 
 
 DISTRIBUTIONS = {"pxr": "usd-core", "skimage": "scikit-image", "websockets": "viser"}
-"""Distributions of modules with another name. viser needs a certain version of websockets and installs it."""
+"""Distribution of each module that has another name. viser installs the version of websockets that it needs."""
 _NAME = re.compile(r"[A-Za-z0-9._-]+")
 _EXTRA = re.compile(r"""extra\s*==\s*["']([^"']+)["']""")
 
@@ -75,14 +76,14 @@ _EXTRA = re.compile(r"""extra\s*==\s*["']([^"']+)["']""")
 def install_extra(extra: str) -> str:
     """Return the command that installs the packages of an extra.
 
-    It names the packages instead of the extra, which would compile polarguide again in a source folder.
+    The command names the packages and not the extra. In a source folder, the extra would compile polarguide again.
     """
     packages = [requirement.text for requirement in requirements() if requirement.extra == extra]
     return _pip(*(packages or [f"polarguide[{extra}]"]))
 
 
 def install_package(module: str) -> str:
-    """Return the command that installs the package of a module in a supported version."""
+    """Return the command that installs a supported version of the package that contains a module."""
     module = module.partition(".")[0]
     package = _plain(DISTRIBUTIONS.get(module, module))
     specified = (requirement.text for requirement in requirements() if _plain(requirement.name) == package)
@@ -95,19 +96,20 @@ def _plain(name: str) -> str:
 
 
 def _pip(*packages: str) -> str:
-    """Return the command line of the pip of this Python, which can differ from the pip in the shell's path."""
+    """Return a command line that runs the pip of this Python, because the shell's pip may belong to another Python."""
     executable = shutil.which("pip")
     ours = executable is not None and Path(executable).parent == Path(sys.executable).parent
     return shlex.join([*(["pip"] if ours else [sys.executable, "-m", "pip"]), "install", *packages])
 
 
 class Requirement(NamedTuple):
-    """Requirement in polarguide's installed metadata.
+    """Requirement of polarguide, read from its installed metadata.
 
     Attributes:
-        name: name of the distribution. text: name and versions, such as ``viser==1.1.*``.
-        extra: extra that includes it; empty: polarguide always requires it.
-        conditional: True if only some systems or versions of Python require it.
+        name: name of the distribution.
+        text: name and versions, such as ``viser==1.1.*``.
+        extra: name of the extra that requires it. An empty name means that polarguide always requires it.
+        conditional: True if only certain operating systems or versions of Python require it.
     """
 
     name: str
@@ -117,7 +119,7 @@ class Requirement(NamedTuple):
 
 
 def requirements() -> list[Requirement]:
-    """Return the requirements in the installed metadata; [] if polarguide is not installed."""
+    """Return the requirements from the installed metadata, or [] if polarguide is not installed."""
     metadata = importlib.import_module("importlib.metadata")
     try:
         lines = metadata.requires("polarguide") or []
@@ -134,7 +136,7 @@ def requirements() -> list[Requirement]:
 
 
 def require_package(module: str, what: str) -> None:
-    """Check that a package is installed before work begins, without importing it; see ``optional_import``.
+    """Check that a package is installed, without importing it, before long work begins; see ``optional_import``.
 
     Raises:
         PolarguideError: the package is not installed.
@@ -148,12 +150,13 @@ def require_package(module: str, what: str) -> None:
 
 
 def optional_import(module: str, what: str) -> Any:
-    """Import a library that few verbs need, and that may be missing.
+    """Import an optional library, which may be missing.
 
-    The handler of Ctrl-C is restored, because libraries such as dask_jobqueue replace it.
+    Libraries such as dask_jobqueue replace the handler of Ctrl-C, so it is restored after the import.
 
     Args:
-        module: name of the module. what: verb or option that needs it, for the message.
+        module: name of the module.
+        what: verb or option that needs the library, for the message.
 
     Raises:
         PolarguideError: the package is not installed.
@@ -182,7 +185,8 @@ def import_part(module: str, what: str) -> Any:
     """Import a module of this package or of another package of the same distribution.
 
     Args:
-        module: full name, such as "polarguide_shots.verbs". what: verb or name that needs it, for the message.
+        module: full name, such as "polarguide_shots.verbs".
+        what: verb or name that needs the module, for the message.
 
     Raises:
         PolarguideError: the package is not installed.

@@ -1,4 +1,4 @@
-"""Reading and writing of files. Writing is atomic, and failures are explained."""
+"""Reading and atomic writing of files, with errors that explain failures."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ LARGEST_FILE = 1 << 31
 def atomic(path: Path) -> Iterator[Path]:
     """Write to a temporary file that replaces ``path`` when it is complete and on disk.
 
-    Temporary files that killed processes left behind are removed.
+    Leftover temporary files of killed processes are removed.
 
     Yields:
         The path of the temporary file, in the same folder.
@@ -50,9 +50,9 @@ def atomic(path: Path) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def temporary_folder(path: Path) -> Iterator[Path]:
-    """Create a temporary folder next to ``path``, and remove it afterwards.
+    """Create a temporary folder next to ``path``, and remove it at the end.
 
-    A folder that a killed process left behind is removed by the next call.
+    If the process is killed, the next call removes the leftover folder.
 
     Raises:
         PolarguideError: the file or folder cannot be written, for example because the disk is full.
@@ -68,7 +68,7 @@ def temporary_folder(path: Path) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def atomic_folder(path: Path) -> Iterator[Path]:
-    """Write into a temporary folder, and then move each complete file into ``path``.
+    """Write into a temporary folder, whose files are moved to ``path`` when all of them are complete.
 
     Yields:
         The temporary folder, next to ``path``, which is created.
@@ -88,9 +88,10 @@ def atomic_folder(path: Path) -> Iterator[Path]:
 
 
 def _temporary(path: Path) -> Path:
-    """Return the temporary name of a file or folder in this process, and remove those of processes that have ended.
+    """Return a temporary path for a file or folder, and remove leftover temporary files of ended processes.
 
-    A temporary file with the number of this process belongs to an earlier process, or is a malicious link.
+    The name contains the number of this process. An existing file of this name is removed as well, because it belongs
+    to an earlier process or is a malicious link.
     """
     with contextlib.suppress(OSError):
         for old in path.parent.glob(f".{glob.escape(path.name)}.*.tmp*"):
@@ -104,7 +105,7 @@ def _temporary(path: Path) -> Path:
 
 @contextlib.contextmanager
 def in_utf8(path: Path) -> Iterator[Path]:
-    """Yield a path in UTF-8 for a file whose name has other bytes. Some libraries accept UTF-8 only."""
+    """Yield a path in UTF-8 to a file whose name may contain other bytes, which some libraries do not accept."""
     try:
         os.fspath(path).encode()
     except UnicodeEncodeError:
@@ -117,7 +118,7 @@ def in_utf8(path: Path) -> Iterator[Path]:
 
 
 def holds_files(folder: Path) -> bool:
-    """Return whether a folder has files other than the temporary ones of a killed process."""
+    """Return True if a folder contains files, apart from leftover temporary files of killed processes."""
     return any(re.fullmatch(r"\..+\.\d+\.tmp", path.name) is None for path in folder.iterdir())
 
 
@@ -133,7 +134,7 @@ def write_whole(path: Path, data: bytes) -> int:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a text file in UTF-8 atomically. Surrogates become escapes.
+    """Write a text file in UTF-8 atomically. Surrogates, which UTF-8 cannot encode, are escaped.
 
     Raises:
         PolarguideError: the file cannot be written.
@@ -153,7 +154,7 @@ def make_folder(path: Path) -> None:
 
 @contextlib.contextmanager
 def writing(path: Path) -> Iterator[None]:
-    """Convert an OSError during the writing of ``path`` to a message with a remedy.
+    """Convert an OSError in this context to an error that explains why ``path`` could not be written.
 
     Raises:
         PolarguideError: the file cannot be written.
@@ -172,9 +173,10 @@ def writing(path: Path) -> Iterator[None]:
 
 
 def stored(path: Path) -> Path:
-    """Return the path that the file system has for a name.
+    """Return the path under which the file system stores a file.
 
-    If the path does not exist, the name of an existing file in another normal form of Unicode is taken.
+    If the path does not exist, but a file exists whose name differs only in the normal form of Unicode, the path of
+    that file is returned.
     """
     if os.path.lexists(path) or path == path.parent:
         return path
@@ -198,7 +200,7 @@ def require_folder(path: Path, *, expected: str, remedy: str) -> None:
 
 
 def require_file(path: Path, *, expected: str, remedy: str) -> None:
-    """Check that a path is a regular file. Reading a pipe or a device may block forever.
+    """Check that a path is a regular file, because reading a pipe or a device may block forever.
 
     Raises:
         PolarguideError: ``path`` is not a regular file, or does not exist.
@@ -227,7 +229,9 @@ def check_out(path: Path) -> None:
 
 
 def require_inside(folder: Path, *paths: Path) -> None:
-    """Refuse paths that links lead out of a folder. The content of the folder may come from somebody else.
+    """Raise an error if a path in a folder leads out of it through a link.
+
+    The content of the folder may come from another person, so its links are not trusted.
 
     Args:
         folder: the output folder, which may be a link itself.
@@ -255,8 +259,8 @@ def read_file(
 
     Args:
         path: the file.
-        largest: limit of its size in bytes.
-        remedy: advice for the message.
+        largest: largest accepted size of the file in bytes.
+        remedy: advice for the error message.
 
     Raises:
         PolarguideError: the file cannot be read, or is too large.
@@ -281,9 +285,9 @@ _LARGEST_TABLE = 1 << 26
 
 
 def read_rows(path: Path, remedy: str) -> list[tuple[int, list[str]]]:
-    """Read the rows of a CSV file that are not empty: line number, from 1, and stripped cells.
+    """Return the line number (1-based) and the stripped cells of each row of a CSV file that is not empty.
 
-    The delimiter is a comma, or a semicolon as in the spreadsheets of some countries.
+    The delimiter is a comma or a semicolon, which spreadsheets use in some countries.
 
     Args:
         path: the file.
@@ -318,7 +322,7 @@ def read_rows(path: Path, remedy: str) -> list[tuple[int, list[str]]]:
 
 
 def _sync_folder(folder: Path) -> None:
-    """Make a rename in a folder durable, on systems that support it."""
+    """Flush a folder to disk, so that a renamed file survives a power failure, on systems that support this."""
     with contextlib.suppress(OSError):
         handle = os.open(folder, os.O_RDONLY)
         try:

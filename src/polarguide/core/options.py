@@ -1,6 +1,7 @@
-"""Options that several verbs share. This module does not import torch.
+"""Options that several verbs share.
 
-The command line takes names, types, defaults and help texts from these classes.
+The command line takes names, types, defaults and help texts from these classes. This module does not import torch, so
+that the command line starts quickly.
 """
 
 from __future__ import annotations
@@ -52,10 +53,10 @@ EXPORT_PACKAGES: dict[str, tuple[str, ...]] = {
     "stl": ("skimage", "trimesh", "fast_simplification"),
     "environment": ("OpenEXR",),
 }
-"""Packages that export formats need. They are checked before a run is loaded."""
+"""Packages that each export format needs. They are checked before a run is loaded."""
 PathLike = str | os.PathLike[str]
 INDEX = 1.5
-"""Refractive index of glass, plastic and glaze: the default for scenes without an index."""
+"""Default refractive index of a scene. It is typical of glass, plastic and glaze."""
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 
 
@@ -63,7 +64,7 @@ MOST = 10**9
 """Largest count that an option accepts."""
 MOST_THREADS = 1024
 LEAST_MEMORY = 2**-10
-"""Smallest memory limit in GiB. No scene fits into less."""
+"""Smallest memory limit that is accepted, in GiB. No scene fits into less memory."""
 
 
 def check_count(name: str, value: int, minimum: int = 1, most: int = MOST) -> None:
@@ -167,11 +168,11 @@ Memory = Annotated[
         str_from_instance=lambda value: [f"{value}GiB"],
     ),
 ]
-"""Memory in GiB; the command line reads sizes such as 4GB."""
+"""Memory in GiB. The command line accepts sizes such as 4GB."""
 
 
 def index_of(specified: float | None, scene: float | None = None) -> float:
-    """Return the specified refractive index, else that of ``scene.json``, else ``INDEX``."""
+    """Return the specified refractive index, the index in ``scene.json``, or ``INDEX``: the first that exists."""
     return next((index for index in (specified, scene) if index is not None), INDEX)
 
 
@@ -239,7 +240,7 @@ class ModelOptions:
 
     @property
     def resolved_base_color(self) -> BaseColor:
-        """The base color, by default the one that fits the option ``unlit``."""
+        """Kind of base color. The default depends on the option ``unlit``."""
         return self.base_color or ("picture" if self.unlit else "delit")
 
 

@@ -1,4 +1,4 @@
-"""Progress of long operations. The default reporter is silent; the command line installs its own."""
+"""Messages and progress of long operations. By default they are ignored; the command line shows them."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Protocol
 
 
 class Advance(Protocol):
-    """Function that reports the progress of an operation."""
+    """Function that an operation calls to report its progress."""
 
     def __call__(
         self, done: int, *, total: int | None = None, note: str = "", seconds: float | None = None
@@ -17,9 +17,9 @@ class Advance(Protocol):
 
         Args:
             done: amount of finished work.
-            total: amount of all work, if it has become known.
+            total: total amount of work, if it is known now.
             note: short text about the state.
-            seconds: time of the report on a clock that stops during pauses; None: there are no pauses.
+            seconds: time of the report on a clock that stops during pauses. None means that there are no pauses.
         """
 
 
@@ -28,21 +28,21 @@ def _ignore(done: int, *, total: int | None = None, note: str = "", seconds: flo
 
 
 class Reporter:
-    """Receiver of messages and progress. This class ignores them; derive from it to show them."""
+    """Receiver of messages and progress. This base class ignores them; a subclass can show them."""
 
     def say(self, text: str) -> None:
-        """Report a result in a plain sentence."""
+        """Report a result as a sentence."""
 
     def warn(self, text: str) -> None:
         """Report a warning."""
 
     @contextlib.contextmanager
     def track(self, label: str, total: int | None = None) -> Iterator[Advance]:
-        """Report the progress of an operation; yields the function that reports the finished work.
+        """Report the progress of an operation. The context yields the function that reports finished work.
 
         Args:
             label: name of the operation.
-            total: amount of work; None: not known yet.
+            total: total amount of work, or None if it is not known yet.
         """
         yield _ignore
 

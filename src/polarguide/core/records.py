@@ -1,6 +1,6 @@
 """Reading and validation of JSON records with msgspec.
 
-Every message names the file, the field, and the value at fault.
+Every error message names the file, the field, and the invalid value.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ _NAMES = {
     "BoolType": "true or false", "FloatType": "a number", "IntType": "a whole number", "NoneType": "null",
     "StrType": "text", "ListType": "a list", "TupleType": "a list", "VarTupleType": "a list",
 }  # fmt: skip
-"""Names of types in messages by class of ``msgspec.inspect``; all others are JSON objects."""
+"""Name of each class of ``msgspec.inspect`` in messages. All other classes are called JSON objects."""
 _LARGEST_INTEGER = 1 << 63
 _DEEPEST = 50
 LARGEST_RECORD = 1 << 26
-"""Largest size of a JSON file in bytes. Decoded data takes about twenty times as much memory."""
+"""Largest accepted size of a JSON file in bytes. Decoded data needs about twenty times as much memory."""
 
 
 def read_record(path: Path, kind: type[T], *, remedy: str = CORRECT) -> T:
@@ -47,7 +47,7 @@ def read_record(path: Path, kind: type[T], *, remedy: str = CORRECT) -> T:
 
 
 def decode(data: bytes | Any, kind: type[T], where: object, *, remedy: str = CORRECT) -> T:
-    """Convert JSON to a record.
+    """Convert JSON to a validated record.
 
     Numbers must be finite, Booleans are not numbers, and keys must be unique. Unknown keys are ignored unless the type
     forbids them.
@@ -55,7 +55,7 @@ def decode(data: bytes | Any, kind: type[T], where: object, *, remedy: str = COR
     Args:
         data: JSON text as bytes, or parsed JSON.
         kind: a type that msgspec supports.
-        where: file or option for messages.
+        where: file or option that error messages name.
         remedy: advice for the message about invalid data.
 
     Raises:
@@ -99,7 +99,7 @@ def parse(data: bytes, where: object, *, remedy: str = CORRECT) -> Any:
 
 
 def _each_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Return a JSON object. The JSON standard does not define the meaning of a repeated key.
+    """Return a JSON object with unique keys, because the JSON standard does not define the meaning of a repeated key.
 
     Raises:
         ValueError: a key occurs twice.
@@ -112,10 +112,10 @@ def _each_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def _require_shallow(value: Any) -> None:
-    """Refuse deeply nested data, which would exceed the recursion limit.
+    """Raise an error for deeply nested data, which later code could not process recursively.
 
     Raises:
-        RecursionError: the data is nested more deeply than any record of ours.
+        RecursionError: the data is nested more deeply than any record of this project.
     """
     level = [value]
     for _ in range(_DEEPEST):
@@ -160,7 +160,7 @@ def check_options(options: Any, name: Callable[[str], str] = option_name) -> Non
 
 
 def to_json(content: Any) -> bytes:
-    """Return a record as a JSON file. Names of files that are not valid Unicode become escapes."""
+    """Return a record as the bytes of a JSON file. File names that are not valid Unicode are escaped."""
     try:
         return (json.dumps(content, indent=1, ensure_ascii=False) + "\n").encode()
     except UnicodeEncodeError:
@@ -172,7 +172,11 @@ def _convert(value: Any, kind: Any) -> Any:
 
 
 def _fault(value: Any, kind: Any, path: str = "") -> tuple[str, str, str]:
-    """Return the path of the part of a value that does not fit a type, the expected type, and the part."""
+    """Find the part of a value that does not fit a type.
+
+    Returns:
+        The path of the part in the value, the expected type, and the part itself, as texts for a message.
+    """
     for step, part, part_kind in _parts(value, kind):
         try:
             _convert(part, part_kind)
@@ -185,7 +189,7 @@ def _fault(value: Any, kind: Any, path: str = "") -> tuple[str, str, str]:
 
 
 def _parts(value: Any, kind: Any) -> Iterator[tuple[str, Any, Any]]:
-    """Yield the parts of a value: the step to each, the part, and its type."""
+    """Yield the direct parts of a value. Each has its path relative to the value, the part, and its expected type."""
     origin = get_origin(kind)
     arguments = get_args(kind)
     if origin in (Annotated, Union, UnionType):
@@ -206,7 +210,7 @@ def _parts(value: Any, kind: Any) -> Iterator[tuple[str, Any, Any]]:
 
 
 def _field_types(kind: Any) -> dict[str, Any]:
-    """Return the types of the fields of a record by name, with the parameters of a generic type filled in."""
+    """Return the type of each field of a record by name. Parameters of a generic type are replaced by actual types."""
     origin = get_origin(kind) or kind
     arguments = dict(zip(getattr(origin, "__parameters__", ()), get_args(kind), strict=False))
     types = get_type_hints(origin, include_extras=True)
@@ -218,7 +222,7 @@ def _field_types(kind: Any) -> dict[str, Any]:
 
 
 def _mismatched_fields(value: Any, options: Any) -> tuple[str, str] | None:
-    """Return the expected and the found fields of a JSON object, or None if the names of its fields are right."""
+    """Return the expected and the actual field names of a JSON object, or None if its field names are valid."""
     for option in options:
         fields = {field.encode_name: field.required for field in getattr(option, "fields", ())}
         if fields and isinstance(value, dict):
@@ -234,7 +238,7 @@ def _mismatched_fields(value: Any, options: Any) -> tuple[str, str] | None:
 
 
 def _described(value: Any, options: Any) -> str:
-    """Return the expected types of a value as text, or the limits if the value has one of these types."""
+    """Describe the expected types of a value, or its limits if the type of the value is valid."""
     names = []
     number = isinstance(value, int | float) and not isinstance(value, bool)
     if number and isinstance(value, int) and abs(value) >= _LARGEST_INTEGER:
@@ -262,9 +266,10 @@ def shortened(value: Any, most: int = 100) -> str:
 
 
 def first_differing_value(name: str, a: Any, b: Any) -> tuple[str, Any, Any]:
-    """Return the first field in which two records differ, and both values (None: not recorded).
+    """Return the name of the first field in which two records differ, and both values.
 
-    A field of a nested record is named by its path, such as ``recipe_data.metal_rules.begin``.
+    A value is None if it is not recorded. The name of a nested field is a path, such as
+    ``recipe_data.metal_rules.begin``.
     """
     if isinstance(a, dict) and isinstance(b, dict):
         key = next(key for key in {**a, **b} if key not in a or key not in b or a[key] != b[key])
@@ -276,7 +281,7 @@ def first_differing_value(name: str, a: Any, b: Any) -> tuple[str, Any, Any]:
 
 
 def _limits(option: Any) -> str:
-    """Return the range of a number as text; empty without a range."""
+    """Return the valid range of a number as text, or an empty text if there is no range."""
     least, above, most, below = (getattr(option, name, None) for name in ("ge", "gt", "le", "lt"))
     if least is not None and most is not None:
         return f"{least:.10g} to {most:.10g}"
@@ -287,7 +292,7 @@ def _limits(option: Any) -> str:
 
 
 def _require_finite(value: Any, where: object, remedy: str, path: str = "") -> None:
-    """Refuse NaN and infinity. Python's JSON parser accepts them although JSON has no such numbers.
+    """Raise an error for NaN and infinity, which Python's JSON parser accepts although JSON does not define them.
 
     Raises:
         PolarguideError: a number is not finite.

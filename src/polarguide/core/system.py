@@ -30,19 +30,19 @@ M_MMAP_THRESHOLD = -3
 NEARLY = 0.9
 """Share of a memory limit above which freed memory is returned to the system."""
 GROWTH = 1.05
-"""Factor on the memory of the largest step above which freed memory is returned again."""
+"""Memory relative to the largest step above which freed memory is returned again."""
 SETTLED = 3
-"""Number of steps that determine the memory of the largest step."""
+"""Number of steps after which the memory of the largest step is known."""
 PARTLY = 0.5
 """Share of a memory limit above which ``MemoryBound.clear`` returns freed memory."""
 _NOT_BUSY = {"idle", "iowait", "guest", "guest_nice"}
-"""Processor times without work, and times that are counted as user time as well."""
+"""Processor times that do not count as busy: idle times, and times that user time already includes."""
 
 Item = TypeVar("Item")
 
 
 def _posix(module: str) -> Any | None:
-    """Return a module of the standard library that only POSIX systems have, else None."""
+    """Import a module of the standard library that only POSIX systems have; return None on other systems."""
     try:
         return importlib.import_module(module)
     except ImportError:
@@ -50,7 +50,7 @@ def _posix(module: str) -> Any | None:
 
 
 def stop_signals() -> list[int]:
-    """Return SIGTERM, and SIGHUP unless it is ignored (nohup) or does not exist."""
+    """Return the signals that stop a process: SIGTERM, and SIGHUP unless it is ignored (nohup) or does not exist."""
     signals = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
     return [
         number for number in signals if signal.getsignal(number) != signal.SIG_IGN or number == signal.SIGTERM
@@ -61,9 +61,9 @@ _interrupts: list[int] = []
 
 
 def interrupt(number: int, frame: FrameType | None) -> None:
-    """Raise KeyboardInterrupt as Python's own signal handler does, and record the signal.
+    """Handle a signal: record it and raise KeyboardInterrupt, as Python's own signal handler does.
 
-    Packages may catch the exception during an import and raise another error.
+    The record is needed, because packages may catch the exception during an import and raise another error.
     """
     _interrupts.append(number)
     signal.default_int_handler(number, frame)
@@ -75,9 +75,10 @@ def interrupts() -> int:
 
 
 class StopSignals:
-    """Context in which Ctrl-C, SIGTERM and SIGHUP request a stop; the object is a training's ``should_stop``.
+    """Context in which Ctrl-C, SIGTERM and SIGHUP stop a training after its current step.
 
-    The signals interrupt at once before the first call of the object, and at a second Ctrl-C.
+    The object is the argument ``should_stop`` of a training. Before its first call, a signal interrupts at once. A
+    second Ctrl-C also interrupts at once.
     """
 
     def __init__(self) -> None:
@@ -111,7 +112,7 @@ class StopSignals:
 
 @contextlib.contextmanager
 def sigterm_kept() -> Iterator[None]:
-    """Restore the handler of SIGTERM, which some libraries replace when they are loaded."""
+    """Restore the handler of SIGTERM at the end, because some libraries replace it when they are loaded."""
     handler = signal.getsignal(signal.SIGTERM)
     yield
     if handler is not None and threading.current_thread() is threading.main_thread():
@@ -120,17 +121,18 @@ def sigterm_kept() -> Iterator[None]:
 
 @contextlib.contextmanager
 def only_writer(lock: Path, *, expected: str, found: str) -> Iterator[None]:
-    """Hold the lock of a folder: a file in it, or the folder itself on systems that support this.
+    """Lock a folder against other processes that write to it.
 
-    Child processes inherit the lock of a file, and hold it if this process is killed.
+    The lock is on a file in the folder, or on the folder itself if the system supports this. Child processes inherit
+    the lock of a file. If this process is killed, they still hold the lock.
 
     Args:
-        lock: the file or folder.
+        lock: file or folder to lock.
         expected, found: fields of the error message.
 
     Raises:
         PolarguideError: another process holds the lock.
-        OSError: the file cannot be opened, or is a link, which may lead to a file of somebody else.
+        OSError: the file cannot be opened, or it is a link, which may lead to a file of another user.
     """
     fcntl = _posix("fcntl")
     is_folder = lock.is_dir()
@@ -174,7 +176,7 @@ def resident_memory() -> int:
 
 
 def return_freed_memory() -> None:
-    """Return freed memory to the system if the allocator is that of glibc."""
+    """Return freed memory to the system if glibc's allocator is in use."""
     with contextlib.suppress(AttributeError, OSError, TypeError):
         ctypes.CDLL(None).malloc_trim(0)
 
@@ -182,11 +184,11 @@ def return_freed_memory() -> None:
 class MemoryBound:
     """Memory limit of a process, near which freed memory is returned to the system.
 
-    The allocator keeps freed memory (``keep_freed_memory``). When sizes change, as with the number of Gaussians, free
-    blocks of old sizes remain between used ones.
+    The allocator keeps freed memory for later use (``keep_freed_memory``). When sizes change, for example with the
+    number of Gaussians, free blocks of old sizes remain between used blocks and waste memory.
 
     Args:
-        limit: bytes that the process may hold; infinity: memory is never returned.
+        limit: memory limit of the process in bytes. With infinity, memory is never returned.
     """
 
     def __init__(self, limit: float = math.inf) -> None:
@@ -197,7 +199,7 @@ class MemoryBound:
         self._waits = 0
 
     def keep(self) -> None:
-        """Return freed memory near the limit. Call it once per step, when steps allocate similar sizes."""
+        """Return freed memory to the system near the limit. Call it once per step if steps allocate similar sizes."""
         resident = resident_memory()
         if self._waits:  # steps allocate up to the largest of them again, so nothing can be returned below it
             self._most = max(self._most, resident)
@@ -209,14 +211,14 @@ class MemoryBound:
             self._waits = SETTLED
 
     def clear(self) -> None:
-        """Return freed memory above half of the limit. Call it between operations that allocate different sizes."""
+        """Return freed memory to the system above half of the limit. Call it between operations of different sizes."""
         if resident_memory() > PARTLY * self._limit:
             return_freed_memory()
 
     def between(self, items: Iterable[Item]) -> Iterator[Item]:
-        """Yield the items, with ``clear`` called before each and after the last.
+        """Yield the items; call ``clear`` before each item and after the last one.
 
-        This avoids fragmentation: memory that is kept for an item does not lie between blocks freed by earlier items.
+        This avoids fragmentation: memory that an item keeps does not lie between blocks that earlier items have freed.
         """
         iterator = iter(items)
         while True:
@@ -248,7 +250,7 @@ def keep_freed_memory() -> None:
 
 
 def network_address() -> str | None:
-    """Return the address of this machine in its network, or None without a network. Nothing is sent."""
+    """Return the address of this machine in its network, or None without a network. No data is sent."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
             probe.connect(("192.0.2.1", 9))  # RFC 5737: an address for documentation
@@ -258,9 +260,10 @@ def network_address() -> str | None:
 
 
 def free_memory(group: Path = Path("/sys/fs/cgroup")) -> int:
-    """Return the bytes of memory that this process may still allocate, by the system and by its control group.
+    """Return the number of bytes that this process may still allocate.
 
-    The system drops cached files of a control group on demand, so they count as free.
+    It is the free memory of the system or of the process's control group, whichever is smaller. Cached files of a
+    control group count as free, because the system drops them on demand.
     """
     available = int(psutil.virtual_memory().available)
     with contextlib.suppress(OSError, ValueError):
@@ -278,7 +281,7 @@ def machine_busy_seconds() -> float:
 
 
 def process_is_alive(pid: int) -> bool:
-    """Return whether a process runs. A zombie does not."""
+    """Return True if a process runs. A zombie does not run."""
     try:
         return psutil.Process(pid).status() not in (psutil.STATUS_ZOMBIE, psutil.STATUS_DEAD)
     except psutil.NoSuchProcess:
@@ -288,13 +291,13 @@ def process_is_alive(pid: int) -> bool:
 
 
 def process_rank() -> int:
-    """Return the rank of this process under torchrun, 0 without torchrun or for an invalid rank."""
+    """Return the rank of this process under torchrun; return 0 without torchrun or if the rank is invalid."""
     text = os.environ.get("RANK", "")
     return int(text) if _is_count(text) else 0
 
 
 def process_count() -> int:
-    """Return the number of processes that torchrun started for this training, 1 without torchrun.
+    """Return the number of processes that torchrun started for this training; return 1 without torchrun.
 
     Raises:
         PolarguideError: a variable of torchrun is invalid.
@@ -341,11 +344,11 @@ def _is_count(text: str) -> bool:
 
 _SIZE = re.compile(r"[0-9]{1,18}(KB|Kb|kb|MB|Mb|mb)?")
 _SIZES = re.compile(r"OPENCV_(IO_MAX_IMAGE_[A-Z]+|IMGCODECS_[A-Z]+_MAX_FILE_SIZE)")
-"""Variables that OpenCV reads when it is loaded. An invalid size ends the process."""
+"""Environment variables with sizes that OpenCV reads when it is loaded. An invalid size would end the process."""
 
 
 def check_variables() -> None:
-    """Validate variables that OpenCV and the kernels read when they are loaded. A wrong value would end the process.
+    """Validate the environment variables of OpenCV and of the kernels, because invalid values would end the process.
 
     Raises:
         PolarguideError: a variable is invalid, or the number of threads is too large.

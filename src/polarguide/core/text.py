@@ -16,9 +16,10 @@ _MOST_DIGITS = 10  # Python itself limits the number of digits
 
 
 def canonical(name: str) -> str:
-    """Return a name in the composed normal form of Unicode (NFC, UAX 15), in which names are compared.
+    """Return a name in the composed normal form of Unicode (NFC, UAX 15), so that equal names compare equal.
 
-    File systems and programs store the same name as different code points: ü is one, or u and a diaeresis.
+    File systems and programs may store one name as different code points. For example, ü is one code point, or u and a
+    diaeresis.
     """
     return unicodedata.normalize("NFC", name)
 
@@ -29,7 +30,9 @@ def stem_of(path: PurePath) -> str:
 
 
 def decimal(text: str) -> float:
-    """Parse a number like ``float``, but without underscores (``1_0`` is more often a typo of 1.0) and foreign digits.
+    """Parse a number like ``float``, but accept only ASCII digits and no underscores.
+
+    A text such as ``1_0`` is probably a typing error for 1.0.
 
     Raises:
         ValueError: the text is not a number.
@@ -40,12 +43,12 @@ def decimal(text: str) -> float:
 
 
 def whole_number(text: str) -> int | None:
-    """Parse a whole number of at most nine ASCII digits; None for other texts."""
+    """Parse a whole number of at most nine ASCII digits; return None for other texts."""
     return int(text) if text.isascii() and text.isdigit() and len(text) < _MOST_DIGITS else None
 
 
 def number_or_nan(text: str) -> float:
-    """Parse a number like ``decimal``; NaN for other texts, so that every comparison with the number fails."""
+    """Parse a number like ``decimal``; return NaN for other texts, so that every comparison fails."""
     try:
         return decimal(text)
     except ValueError:
@@ -53,7 +56,7 @@ def number_or_nan(text: str) -> float:
 
 
 def decimals(text: str) -> tuple[float, ...]:
-    """Parse a comma-separated list of numbers such as 1.9,1,1.6; empty for other texts."""
+    """Parse a comma-separated list of numbers such as 1.9,1,1.6; return an empty tuple for other texts."""
     try:
         return tuple(decimal(part) for part in text.split(","))
     except ValueError:
@@ -61,7 +64,7 @@ def decimals(text: str) -> tuple[float, ...]:
 
 
 def listed(names: Sequence[str], limit: int = 4) -> str:
-    """Return the first few names and the number of the others, for messages."""
+    """Return the first ``limit`` names as text, and the number of further names, for messages."""
     rest = len(names) - limit
     return ", ".join(names[:limit]) + (f" and {rest} more" if rest > 0 else "")
 
@@ -70,7 +73,7 @@ def command(*words: object) -> str:
     """Return a command line of polarguide with quoted names, ready for a shell.
 
     Args:
-        words: the verb and its arguments; capital letters alone, such as SCENE, are placeholders.
+        words: the verb and its arguments. A word in capital letters, such as SCENE, is a placeholder and is not quoted.
     """
     return shlex.join(["polarguide", *map(str, words)])
 
@@ -79,16 +82,16 @@ _DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+([eE][+-]?\d+)?")
 
 
 def decimal_comma(cells: Iterable[str]) -> str:
-    """Return the first text that is a number with a decimal comma, such as ``0,9238``, else an empty text."""
+    """Return the first cell that is a number with a decimal comma, such as ``0,9238``, or an empty text."""
     return next((cell for cell in cells if _DECIMAL_COMMA.fullmatch(cell)), "")
 
 
 def printable(text: str, *, lines: bool = False) -> str:
-    """Escape control characters in a text, such as names of files, before it is printed.
+    """Escape control characters in a text, such as a file name, so that it is safe to print.
 
     Args:
         text: the text.
-        lines: True: keep line breaks.
+        lines: keep line breaks.
     """
     with contextlib.suppress(
         UnicodeEncodeError
@@ -108,7 +111,7 @@ _FORMULA = ("=", "+", "-", "@", "\t", "\r")
 def csv_lines(rows: Iterable[Iterable[object]]) -> str:
     """Return rows of values as CSV.
 
-    None is an empty cell, and an apostrophe precedes a text that looks like a formula.
+    None becomes an empty cell. A text that looks like a formula gets an apostrophe in front.
     """
     file = io.StringIO()
     csv.writer(file, lineterminator="\n").writerows([csv_value(value) for value in row] for row in rows)
@@ -116,7 +119,7 @@ def csv_lines(rows: Iterable[Iterable[object]]) -> str:
 
 
 def csv_value(value: object) -> object:
-    """Return a value without formulas for spreadsheets and control sequences for terminals."""
+    """Make a value safe for spreadsheets and terminals: disable formulas and escape control characters."""
     if not isinstance(value, str):
         return value
     return printable(f"'{value}" if value.startswith(_FORMULA) else value, lines=True)

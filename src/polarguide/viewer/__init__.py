@@ -1,4 +1,4 @@
-"""A local web viewer for trained runs and for trainings in progress."""
+"""Local web viewer for trained runs and for trainings in progress."""
 
 from polarguide.core.options import LOOPBACK
 from polarguide.viewer.cameras import photographs

@@ -1,4 +1,4 @@
-"""Cameras of a browser's window: free cameras, photographs' poses, keyframes, and clickable frusta."""
+"""Cameras in a browser's window: free cameras, poses of photographs, keyframes, and clickable frusta."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def free_camera(
     """Return a camera with square pixels and a centered principal point.
 
     Args:
-        wxyz: quaternion of the camera-to-world rotation, in OpenCV's axes.
+        wxyz: quaternion of the camera-to-world rotation. The camera has OpenCV axes.
         position: camera center in the world.
         fov: vertical field of view in radians.
         frame_size: width and height in pixels.
@@ -42,7 +42,7 @@ def free_camera(
 
 
 def letterboxed(photograph: Picture, frame_size: tuple[int, int]) -> Picture:
-    """Return a photograph in a window of another aspect ratio: as large as possible, centered, on gray.
+    """Fit a photograph into a window of another aspect ratio. It is centered on gray and as large as possible.
 
     Args:
         photograph: uint8 [h, w, 3].
@@ -60,7 +60,10 @@ def letterboxed(photograph: Picture, frame_size: tuple[int, int]) -> Picture:
 
 
 def drawn_camera(camera: Camera, view: View | None) -> Camera:
-    """Return the camera of a window's picture: the free camera, or a view's pose with the window's size."""
+    """Return the camera with which a window's picture is rendered.
+
+    It is the free camera or, if ``view`` is set, the pose of this view with the size of the window.
+    """
     if view is None:
         return camera
     return view.camera.extended(camera.width, camera.height)
@@ -74,14 +77,14 @@ MOVED = 1e-4
 
 @dataclass(eq=False)
 class ViewPose:
-    """The view whose pose a session's camera has.
+    """View to whose pose the camera of a session was moved.
 
     Attributes:
-        view: the view.
+        view: view of the scene.
         wxyz, position: the pose that was sent to the browser.
-        since: the time when it was sent.
-        written: viser's time stamp of this change of the camera.
-        reached: whether the browser has reported this pose. Until then it may report earlier poses.
+        since: time at which the pose was sent.
+        written: time stamp with which viser recorded this change of the camera.
+        reached: True if the browser has reported this pose. Before that, it may still report earlier poses.
     """
 
     view: View
@@ -92,7 +95,7 @@ class ViewPose:
     reached: bool = False
 
     def is_kept(self, camera: Any, now: float, distance: float) -> bool:
-        """Return whether a browser's camera has this pose, or may still be moving to it.
+        """Return True if a browser's camera has this pose, or may still be moving to it.
 
         Args:
             camera: viser's camera.
@@ -108,7 +111,7 @@ class ViewPose:
 
 
 def move_to_view(client: Any, view: View, scene_frame: SceneFrame, now: float) -> ViewPose:
-    """Move a browser's camera to the pose of a view, with a field of view that contains the photograph."""
+    """Move a browser's camera to the pose of a view. Its field of view then contains the whole photograph."""
     camera = client.camera
     target = view.camera
     center = view.camera.center
@@ -132,14 +135,17 @@ MOST_KEYFRAMES = 50
 
 
 def keyframe(camera: Camera, frame_size: tuple[int, int]) -> Camera:
-    """Return a camera with another picture size, width and height, and the same vertical field of view."""
+    """Return a camera with another picture size (width, height) and the same vertical field of view."""
     width, height = frame_size
     focal = camera.fy * height / camera.height
     return replace(camera, width=width, height=height, fx=focal, fy=focal, cx=0.5 * width, cy=0.5 * height)
 
 
 def keyframe_path(keyframes: list[Camera], seconds: float) -> list[Camera]:
-    """Return the smooth path with ``seconds`` between keyframes. Fewer than two keyframes are returned unchanged."""
+    """Return a smooth camera path that takes ``seconds`` from one keyframe to the next.
+
+    Fewer than two keyframes are returned unchanged.
+    """
     if len(keyframes) < 2:
         return keyframes
     return interpolated(keyframes, 1 + round((len(keyframes) - 1) * seconds * FRAMES_PER_SECOND))
@@ -164,7 +170,7 @@ EDGES = [(i, i | bit) for bit in (1, 2, 4) for i in range(8) if not i & bit]
 
 @dataclass(frozen=True, eq=False)
 class Photograph:
-    """A photograph, its thumbnail (uint8 [h, w, 3] RGB), and whether it is held out from training."""
+    """Photograph with its thumbnail (uint8 RGB [h, w, 3]), marked if it is held out from training."""
 
     view: View
     thumbnail: Picture
@@ -172,7 +178,7 @@ class Photograph:
 
 
 def photographs(scene: Scene) -> dict[str, Photograph]:
-    """Return all photographs of a scene by name of the view."""
+    """Return all photographs of a scene by view name."""
     tests = set(scene.test_names)
     found = {}
     for view in scene.views:
@@ -191,7 +197,7 @@ class Frusta:
         scene: viser's scene handle of one session.
         photographs: photographs to show.
         scene_frame: frame of the scene.
-        go: callback with a view's name when its frustum is clicked.
+        go: callback that receives the name of a view when its frustum is clicked.
     """
 
     def __init__(
@@ -235,7 +241,7 @@ class Frusta:
         self._update()
 
     def hide_near(self, position: np.ndarray | None) -> None:
-        """Hide the frusta near a camera position [3], which would cover the picture. None: hide all."""
+        """Hide the frusta near a camera position [3], which would cover the picture. None hides all frusta."""
         near = True if position is None else np.linalg.norm(self._centers - position, axis=1) < self._reach
         self._far = ~np.broadcast_to(near, len(self._handles))
         self._update()
@@ -247,7 +253,7 @@ class Frusta:
                 handle.visible = visible
 
     def show_box(self, crop: Crop | None) -> None:
-        """Draw the crop box. None: remove it."""
+        """Draw a crop box, or remove the drawn box if ``crop`` is None."""
         if self._box is not None:
             self._box.remove()
             self._box = None

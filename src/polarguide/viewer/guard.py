@@ -1,4 +1,4 @@
-"""Access control of the viewer. viser itself authenticates nobody, and trusts every message.
+"""Access control of the viewer, because viser has no authentication and trusts every message.
 
 Web pages of other sites that are open in the same browser must not connect to the viewer. viser has no hook for this.
 Therefore ``websockets``' function ``serve`` is wrapped while viser starts to listen. The version of viser is pinned,
@@ -34,25 +34,25 @@ CAMERA_LIMITS = {
     "fov": (0.01, 3.0), "near": (1e-9, 1e9), "far": (1e-9, 1e12),
     "image_height": (1, LARGEST_WINDOW), "image_width": (1, LARGEST_WINDOW),
 }  # fmt: skip
-"""Ranges of a camera's numbers; the field of view is in radians."""
+"""Valid range of each number of a camera. The field of view is in radians."""
 NO_RAY = {"ray_origin": (0.0,) * 3, "ray_direction": (0.0, 0.0, 1.0)}
-"""Placeholder for the ray of a click. A session computes it from the place in the window."""
+"""Placeholder for the ray of a click. A session computes the ray from the clicked position in the window."""
 
 Accepts = Callable[[Any], Any]
-"""Function that returns the value of a control within its range, and raises ``Refused`` for other types."""
+"""Function that clamps the value of a control to its range, and raises ``Refused`` for a value of another type."""
 
 
 class Refused(Exception):
-    """A message that the viewer's page never sends."""
+    """Error for a message that the viewer's page never sends."""
 
 
 def checked_message(raw: bytes | str, control: Callable[[str], Accepts | None], reach: float) -> bytes | None:
-    """Return a valid message for viser, or None for a message to ignore.
+    """Check a message, and return it with clamped values, or return None if viser must not receive it.
 
     Args:
-        raw: MessagePack.
-        control: returns the validation of a control by viser's name, None for an unknown name.
-        reach: the largest coordinate of a camera.
+        raw: message in the format MessagePack.
+        control: returns the function that validates a control by its name in viser, or None for an unknown name.
+        reach: largest coordinate of a camera.
 
     Raises:
         Refused: the viewer's page never sends such a message.
@@ -84,17 +84,17 @@ def checked_message(raw: bytes | str, control: Callable[[str], Accepts | None], 
 
 
 def number(low: float, high: float) -> Accepts:
-    """Accept a number, clamped to a range."""
+    """Return a check that accepts a number and clamps it to a range."""
     return lambda value: _clamped(value, low, high)
 
 
 def pair(low: float, high: float) -> Accepts:
-    """Accept two numbers, clamped to a range and sorted."""
+    """Return a check that accepts two numbers, clamps them to a range, and sorts them."""
     return lambda value: sorted(_clamped(item, low, high) for item in _numbers(value, 2))
 
 
 def choice(options: Sequence[str]) -> Accepts:
-    """Accept one of some texts."""
+    """Return a check that accepts one of the texts in ``options``."""
 
     def accepts(value: Any) -> str:
         if not isinstance(value, str) or value not in options:
@@ -105,19 +105,19 @@ def choice(options: Sequence[str]) -> Accepts:
 
 
 def flag(value: Any) -> bool:
-    """Accept true or false."""
+    """Accept True or False."""
     if not isinstance(value, bool):
         raise Refused("a value other than on or off")
     return value
 
 
 def push(_: Any) -> bool:
-    """Accept any value, for a button."""
+    """Accept any value, because the value of a button has no meaning."""
     return True
 
 
 def _camera(message: dict[str, Any], reach: float) -> dict[str, Any]:
-    """Return the clamped fields of a camera, with unit vectors as directions."""
+    """Return the fields of a camera in a message, with clamped numbers and normalized directions."""
     fields: dict[str, Any] = {
         name: _clamped(message[name], *limits) for name, limits in CAMERA_LIMITS.items()
     }
@@ -155,19 +155,19 @@ def _clamped(value: Any, low: float, high: float) -> float:
 
 WEB = ("http", "https")
 _PLACE = re.compile(r"(\[[^\[\]]*\]|[^\[\]:@]*)(:[0-9]*)?")
-"""Host of a URL, NAME or [ADDRESS], with an optional port."""
+"""Host in a URL: NAME or [ADDRESS], with an optional port."""
 _NAME = re.compile(r"[\w-]+(\.[\w-]+)*")
-"""Name of a host, without wildcards."""
+"""Host name without wildcards."""
 
 
 class Gate:
-    """Rules for the hosts and origins of requests. Ports are ignored, since tunnels change them.
+    """Rules that accept or refuse requests by their host and origin. Ports are ignored, because tunnels change them.
 
     Args:
         listening: host of the server, which requests may name.
         hosts: further host names under which the viewer may be opened.
-        origins: sites of pages that may connect, as ``https://NAME`` or ``NAME``, in addition to the viewer's own
-            pages.
+        origins: sites whose pages may connect, in addition to the viewer's own pages. A site is ``https://NAME`` or
+            ``NAME``.
 
     Raises:
         PolarguideError: a name is not a host name or an address.
@@ -178,7 +178,7 @@ class Gate:
         self._origins = {_given("allow_origin", name) for name in origins}
 
     def refusal(self, headers: Any) -> str | None:
-        """Return the reason and the remedy for refusing a request, or None for a valid request.
+        """Return the reason for refusing a request, with a remedy. Return None for a valid request.
 
         An unknown name may belong to a stranger and point to this machine (DNS rebinding). The origin is the page
         that sends the request; programs other than browsers send none.
@@ -204,7 +204,7 @@ class Gate:
 
 
 def host_of(url: str, schemes: tuple[str, ...] = ("",)) -> str | None:
-    """Return the host of SCHEME://HOST[:PORT] in lower case, or None for other texts."""
+    """Return the host of SCHEME://HOST[:PORT] in lower case; return None for other texts."""
     try:
         parts = urlsplit(url)
         host = parts.hostname
@@ -218,7 +218,7 @@ def host_of(url: str, schemes: tuple[str, ...] = ("",)) -> str | None:
 
 
 def _given(option: str, name: str) -> str:
-    """Return the host of an option's value, NAME or a URL."""
+    """Return the host in the value of an option, which is a host name or a URL."""
     host = host_of(name if "://" in name else f"//{name}", schemes=("", *WEB))
     if host is None or not (_is_address(host) or _NAME.fullmatch(host)):
         raise PolarguideError(
@@ -253,7 +253,7 @@ HEADERS = {
     "Referrer-Policy": "no-referrer",
 }
 Check = Callable[[bytes | str], bytes | None]
-"""Function that returns a valid message, None for a message to ignore, or raises ``Refused``."""
+"""Function that returns a valid message, returns None for a message to ignore, or raises ``Refused``."""
 
 _WRAPPING = threading.Lock()
 _QUIET = logging.getLogger("polarguide.viewer.connections")  # broken requests of strangers are not logged
@@ -263,10 +263,10 @@ _QUIET.addHandler(logging.NullHandler())
 
 @contextlib.contextmanager
 def guarded(gate: Gate, check: Check) -> Iterator[None]:
-    """Install the access control while viser starts to listen inside this context.
+    """Install the access control in this context, in which viser must start to listen.
 
     Raises:
-        PolarguideError: viser did not listen through the wrapper; the caller must stop viser.
+        PolarguideError: viser did not use the wrapped function. Then the caller must stop viser.
     """
     sockets = optional_import("websockets.asyncio.server", "the viewer")
     listen = sockets.serve
@@ -336,7 +336,7 @@ def _handled(handler: Any, check: Check) -> Callable[[Any], Any]:
 
 
 class _Connection:
-    """Connection of a browser with validated messages, a rate limit and a timeout."""
+    """Connection of a browser that validates messages, limits their rate, and has a timeout."""
 
     def __init__(self, connection: Any, check: Check) -> None:
         self._connection = connection
@@ -365,14 +365,14 @@ class _Connection:
                 return message
 
     async def send(self, data: bytes) -> None:
-        """Send data; abort the connection if the browser does not receive it in time."""
+        """Send data, or abort the connection if the browser does not receive the data in time."""
         try:
             await asyncio.wait_for(self._connection.send(data), SENDING_SECONDS)
         except asyncio.TimeoutError:
             self._connection.transport.abort()
 
     async def _pace(self) -> None:
-        """Wait so that messages are read no faster than ``MESSAGES_PER_SECOND``."""
+        """Limit the rate of messages to ``MESSAGES_PER_SECOND`` by waiting."""
         now = time.monotonic()
         self._left = min(BURST, self._left + (now - self._since) * MESSAGES_PER_SECOND) - 1
         self._since = now

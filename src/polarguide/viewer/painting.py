@@ -1,4 +1,4 @@
-"""Painting of materials on Gaussians: a disc around a click, or a connected surface; with undo."""
+"""Painting of materials on Gaussians, in a disc around a click or on a connected surface, with undo."""
 
 from __future__ import annotations
 
@@ -28,32 +28,32 @@ from polarguide.visualization.figures import Picture
 
 ASK = "Click on a surface"
 TINTS = np.array([(0, 0, 0), (40, 120, 255), (255, 190, 0), (0, 200, 120)], np.float32)
-"""Colors of unpainted parts, dielectrics, metals, and dielectrics with an index of their own."""
+"""Colors in which unpainted parts, dielectrics, metals, and dielectrics with their own index are shown."""
 TINTED = 0.5
 LOOKED_AT = 360
-"""Largest height in pixels of the pictures in which clicks are looked up."""
+"""Largest height of the pictures that are rendered to find the clicked Gaussians, in pixels."""
 SMALLEST = 0.01
-"""Least number of pixels that a visible Gaussian fills in such a picture."""
+"""Minimum number of pixels that a visible Gaussian fills in such a picture."""
 SHARE = 0.25
-"""Surfaces grow from Gaussians that fill at least this share of the largest one in a disc."""
+"""Share of the largest Gaussian's pixels in a disc that a Gaussian must fill so that a surface grows from it."""
 NEIGHBORS = 16
-"""Number of Gaussians over which normals and colors are averaged."""
+"""Number of neighboring Gaussians over which normals and colors are averaged."""
 LINKS = 8
-"""Number of neighbors in the graph of a Gaussian."""
+"""Number of neighbors of each Gaussian in the graph."""
 CHUNK = 1 << 16  # number of Gaussians per batch
 TURN = 0.25
 """Standard deviation of the angle between neighboring normals, in radians."""
 COLOR = 0.3
 """Standard deviation of the logarithm of neighboring colors.
 
-The reach of a click is in these units, squared, halved and summed along the surface.
+The length of an edge in the graph is half the sum of the squared differences of normals and colors in these units.
 """
 DARK = 0.02  # offset of radiance before the logarithm
 MOST_UNDONE = 50
 
 
 class Materials:
-    """Painted materials of a model's Gaussians.
+    """Materials of a model's Gaussians that a visitor paints.
 
     Attributes:
         kinds: [N] uint8: 0 unpainted, 1 dielectric, 2 metal, from 3 on the dielectrics of ``scene.json``.
@@ -61,7 +61,7 @@ class Materials:
     Args:
         gaussians: Gaussians of the model.
         rasterize: rasterizer of its backend.
-        kinds: returns the initial ``kinds``; called once.
+        kinds: function that returns the initial ``kinds``. It is called once.
     """
 
     def __init__(
@@ -74,11 +74,11 @@ class Materials:
         self._before: list[Tensor] = []
 
     def brush(self, camera: Camera, place: Sequence[float], size: float, kind: int) -> int:
-        """Paint the Gaussians that are visible in a disc of a picture; returns their number.
+        """Paint the Gaussians that are visible in a disc of a picture, and return their number.
 
         Args:
             camera: camera of the picture.
-            place: center of the disc, in shares of width and height.
+            place: center of the disc, as shares of width and height.
             size: radius in percent of the height.
             kind: number of the material.
         """
@@ -86,12 +86,13 @@ class Materials:
         return self._paint((all_of_it > SMALLEST) & (inside >= 0.5 * all_of_it), kind)
 
     def surface(self, camera: Camera, place: Sequence[float], size: float, reach: float, kind: int) -> int:
-        """Paint the connected surface that is visible in a disc; see ``brush``.
+        """Paint the connected surface around the Gaussians that are visible in a disc; see ``brush``.
 
-        A path leads from Gaussian to neighbor. The length of a step is their difference in normal and color.
+        A Gaussian belongs to the surface if a path of neighbors leads to it. The length of a step is the difference of
+        normals and colors of both Gaussians.
 
         Args:
-            reach: length of the longest path.
+            reach: largest length of a path.
         """
         inside, _ = self._painted(camera, place, size)
         hit = (inside > SHARE * inside.max()).nonzero()[:, 0].numpy()
@@ -101,14 +102,14 @@ class Materials:
         return self._paint(torch.from_numpy(np.isfinite(lengths)), kind)
 
     def undo(self) -> bool:
-        """Undo the last stroke, and return False without a stroke."""
+        """Undo the last stroke. Return False if there is no stroke."""
         if self._before:
             self.kinds = self._before.pop()
             return True
         return False
 
     def picture(self, camera: Camera) -> Tensor:
-        """Return the number of the material that fills at least half of each pixel, else 0: [H, W] uint8."""
+        """Render the number [H, W] uint8 of the material that fills at least half of each pixel, or 0 without one."""
         numbers = [number for number in self.kinds.unique().tolist() if number]
         if not numbers:
             return torch.zeros(camera.height, camera.width, dtype=torch.uint8)
@@ -125,7 +126,7 @@ class Materials:
         return int(which.sum())
 
     def _painted(self, camera: Camera, place: Sequence[float], size: float) -> tuple[Tensor, Tensor]:
-        """Return the number of pixels of each Gaussian in a disc of a picture, and in the picture: [N] both."""
+        """Return how many pixels each Gaussian fills, [N], in a disc of a picture and in the whole picture."""
         scale = min(1.0, LOOKED_AT / camera.height)
         small = camera.scaled(
             scale, max(1, round(scale * camera.width)), max(1, round(scale * camera.height))
@@ -143,9 +144,9 @@ class Materials:
 
     @cached_property
     def _graph(self) -> csr_matrix:
-        """Distances of neighboring Gaussians in normal and color.
+        """Graph of neighboring Gaussians with their distances in normal and color.
 
-        Both are averaged over neighborhoods, since those of single Gaussians are noisy.
+        Normals and colors are averaged over neighborhoods, because single Gaussians are noisy.
         """
         gaussians = {name: values.cpu() for name, values in self._gaussians.items()}
         means = gaussians["means"]
@@ -167,7 +168,10 @@ class Materials:
 
 
 def _averaged(axes: Tensor, colors: Tensor, weights: Tensor, near: Tensor) -> tuple[Tensor, Tensor]:
-    """Return unit axes of either sign [N, 3] and colors [N, 3], averaged over neighbors [N, K] with weights [N]."""
+    """Average axes [N, 3] and colors [N, 3] over the neighbors [N, K] of each Gaussian, with weights [N].
+
+    The averaged axes are normalized. Their sign is arbitrary.
+    """
     parts = []
     for some in near.split(CHUNK):
         counts = weights[some][..., None]
@@ -181,12 +185,14 @@ def _averaged(axes: Tensor, colors: Tensor, weights: Tensor, near: Tensor) -> tu
 def kinds_of(
     gaussians: Gaussians, rasterize: Rasterize, views: Sequence[View], numbers: Mapping[str, Tensor]
 ) -> Tensor:
-    """Return the material of each Gaussian from pictures of materials: the one of most of its pixels, [N] uint8.
+    """Determine the material [N] uint8 of each Gaussian from pictures of materials.
+
+    It is the most frequent material in the pixels that the Gaussian fills.
 
     Args:
         gaussians, rasterize: the model.
-        views: views of the pictures.
-        numbers: numbers of materials [H, W] uint8 by view.
+        views: views to which the pictures belong.
+        numbers: number of the material of each pixel, [H, W] uint8, by view.
     """
     parameters = {name: gaussians[name].detach() for name in gaussians.names}
     named = sorted({0}.union(*(picture.unique().tolist() for picture in numbers.values())))
@@ -200,12 +206,12 @@ def kinds_of(
 
 @dataclass(frozen=True, eq=False)
 class Paintable:
-    """Materials of a run that visitors can paint.
+    """Materials of a run that visitors of the viewer can paint.
 
     Attributes:
-        materials: returns the initial materials of a session.
+        materials: function that returns the initial materials of a session.
         kinds: numbers of materials by name.
-        save: writes materials to the run and returns a message.
+        save: function that writes materials to the run and returns a message.
     """
 
     materials: Callable[[], Materials]
@@ -214,13 +220,15 @@ class Paintable:
 
 
 class Painting:
-    """Painting of one session. Callbacks only record; the rendering thread calls ``act``.
+    """Painting tool of one session.
+
+    Callbacks only record the actions of the visitor. The rendering thread executes them with ``act``.
 
     Args:
         client: viser's handle.
         panel: controls of the session.
         paintable: materials that can be painted.
-        busy: returns whether another tool takes clicks.
+        busy: function that returns True if another tool receives the clicks.
     """
 
     def __init__(self, client: Any, panel: Panel, paintable: Paintable, *, busy: Callable[[], bool]) -> None:
@@ -236,14 +244,14 @@ class Painting:
 
     @property
     def waits(self) -> bool:
-        """True if a recorded action is pending."""
+        """True if a recorded action has not been executed yet."""
         return bool(self._todo)
 
     def act(self, camera: Camera) -> None:
         """Execute the recorded actions.
 
         Args:
-            camera: camera of the clicked picture.
+            camera: camera of the picture in which the visitor clicked.
         """
         todo = self._todo
         self._todo = []
@@ -253,7 +261,7 @@ class Painting:
             self._panel.show_note(each(self._materials, camera))
 
     def tinted(self, picture: Picture, camera: Camera) -> Picture:
-        """Return a picture tinted with the painted materials."""
+        """Tint a picture in the colors of the painted materials."""
         if self._materials is None or not bool(self._materials.kinds.any()):
             return picture
         numbers = self._materials.picture(camera).numpy().clip(max=len(TINTS) - 1)

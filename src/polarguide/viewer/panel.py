@@ -1,4 +1,4 @@
-"""Control panel of a session: a table of its controls, their values, and picks of white, up axis and scale."""
+"""Control panel of a session, with clicks that select white balance, up axis and scale."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ FREE_VIEW = "(free)"
 STEPS = ("previous", "next")
 # Ranges of the controls.
 SIDES = {"left_right": "Left, right", "down_up": "Down, up", "front_back": "Front, back"}
-"""Labels of the sliders of the crop box by control."""
+"""Label of each slider of the crop box."""
 EXPOSURE = (-STOPS, STOPS)
 STRENGTH = (0.0, 2.0)
 TURN = (-180, 180)
@@ -31,7 +31,7 @@ SECONDS = (0.5, 10.0)
 CROP = (-150, 150)
 WIPE = (0, 100)
 KNOWN_LENGTH = (0.001, 1e8)
-"""Range of the known length in millimeters."""
+"""Valid range of the known length, in millimeters."""
 SIZE = (0.5, 20.0)
 REACH = (0.5, 30.0)
 # Choices of the controls.
@@ -49,12 +49,12 @@ class PanelOptions:
 
     Attributes:
         layers: layers of the shading model.
-        turns: whether the environment can be rotated.
+        turns: True if the environment can be rotated.
         views: names of the photographs.
-        trains: whether the panel can pause a training.
+        trains: True if the panel can pause a training.
         presentation: the saved presentation.
-        saves: whether the presentation is saved to the run; otherwise the browser downloads it.
-        kinds: numbers of the materials that can be painted; empty: no painting.
+        saves: True if the presentation is saved to the run. Otherwise the browser downloads it.
+        kinds: numbers of the materials that can be painted. Without materials, the panel has no painting tool.
     """
 
     layers: Sequence[str]
@@ -70,11 +70,11 @@ class Control(NamedTuple):
     """Description of a control.
 
     Attributes:
-        kind: name of viser's method without ``add_``.
+        kind: kind of control: the name of viser's method without ``add_``.
         label: text next to the control.
-        arguments: further positional arguments.
-        accepts: validation of the values that a browser sets; None: the control is read-only.
-        options: keyword arguments.
+        arguments: further positional arguments of the method.
+        accepts: function that validates a value from a browser, or None if the control is read-only.
+        options: keyword arguments of the method.
     """
 
     kind: str
@@ -85,7 +85,7 @@ class Control(NamedTuple):
 
 
 def controls_of(options: PanelOptions) -> dict[str, dict[str, Control]]:
-    """Return the controls of a panel by folder and name. The folder without a label is the panel itself."""
+    """Return the controls of a panel by folder and name. An empty folder label stands for the panel itself."""
     presentation = options.presentation
     layers = (*options.layers, *MEASURED)
     views = (FREE_VIEW, *options.views)
@@ -160,21 +160,21 @@ def controls_of(options: PanelOptions) -> dict[str, dict[str, Control]]:
 
 
 class Panel:
-    """Controls of one session by name: ``panel["layer"].value``.
+    """Controls of one session. A control is accessed by its name, such as ``panel["layer"].value``.
 
-    Names of views come from files, so they are shown as plain text: Markdown in the browser may run code.
+    Names of views come from files. They are shown as plain text, because Markdown in the browser may run code.
 
     Attributes:
-        accepts: validation of the values that a browser sets, by viser's name of the control.
+        accepts: functions that validate values from a browser, by the name of the control in viser.
         changed: callback after every change of the picture.
 
     Args:
         gui: viser's handle of the session's controls.
         options: options of the panel.
         changed: callback after every change of the picture.
-        drop: callback with the exception of another callback.
-        folded: whether the controls are in a closed folder. On a phone viser's panel is open at first and covers half
-            of the picture, and a server cannot fold it.
+        drop: callback that receives the exception of another callback.
+        folded: True to place the controls in a closed folder. On a phone, viser's panel is open at first and covers
+            half of the picture, and the server cannot close it.
     """
 
     def __init__(
@@ -227,7 +227,7 @@ class Panel:
         subscribe(self.caught(act))
 
     def caught(self, act: Callable[[], None]) -> Callable[[Any], None]:
-        """Return a callback that shows a user's mistake as a note.
+        """Wrap a function as a callback that shows errors in the visitor's input as a note.
 
         Other errors close only the connection of this browser.
         """
@@ -246,19 +246,19 @@ class Panel:
         self._saved_crop = None
 
     def show_note(self, note: str) -> None:
-        """Show a note below the status. It must not contain names from files."""
+        """Show a note below the status. The note must not contain names from files."""
         self._note = note
         self.show_status(*self._lines)
 
     def show_status(self, *lines: str) -> None:
-        """Show status lines. They must not contain names from files."""
+        """Show status lines. The lines must not contain names from files."""
         self._lines = lines
         text = "  \n".join((*lines, f"**{self._note}**") if self._note else lines)
         if self._status.content != text:
             self._status.content = text
 
     def crop(self, up_axis: Vector | None = None) -> Crop | None:
-        """Return the crop box with an up axis (None: that of the cameras), or None without cropping."""
+        """Return the crop box, or None without cropping. If ``up_axis`` is None, the cameras' up axis is used."""
         if not self["crop"].value:
             return None
         if self._saved_crop is not None:
@@ -270,7 +270,7 @@ class Panel:
         return Crop(low, (high[0], high[1], high[2]), up_axis)
 
     def presentation(self, chosen: Presentation) -> Presentation:
-        """Return a presentation with the exposure and the crop box of the panel."""
+        """Return a presentation with exposure and crop box from the panel."""
         crop = self.crop(chosen.up_axis)
         exposure = float(self["exposure"].value) or None
         return msgspec.structs.replace(
@@ -278,7 +278,7 @@ class Panel:
         )
 
     def appearance(self, chosen: Presentation) -> Appearance:
-        """Return the appearance of the picture by the panel and the visitor's presentation."""
+        """Return the appearance of the picture, from the controls of the panel and the visitor's presentation."""
         return Appearance(
             layer=self["layer"].value,
             strength=float(self["strength"].value),
@@ -289,7 +289,7 @@ class Panel:
 
 
 def _percent(crop: Crop | None) -> list[tuple[int, int]]:
-    """Return the positions of the sliders of a crop box."""
+    """Convert a crop box to the positions of its sliders."""
     if crop is None:
         return [(-40, 40)] * 3
     percents = []
@@ -305,19 +305,19 @@ ASKS = {
     "level": "Click on a level surface",
     "length": "Click on one end of a known length",
 }
-"""Request for a click by the picked quantity."""
+"""Text that requests a click, for each quantity that a click sets."""
 
 
 class Clicks:
-    """Clicks into the picture of one browser, received while a tool needs them.
+    """Receiver of clicks into the picture of one browser, active only while a tool needs them.
 
     Attributes:
-        wanted: whether clicks are received.
+        wanted: True if clicks are received.
 
     Args:
         client: viser's handle.
         panel: controls of the session.
-        clicked: callback with the place, in shares of the picture's width and height.
+        clicked: callback that receives the position of a click, as shares of the picture's width and height.
     """
 
     def __init__(self, client: Any, panel: Panel, clicked: Callable[[Sequence[float]], None]) -> None:
@@ -339,19 +339,19 @@ class Clicks:
 
 
 class Presenting:
-    """Presentation of one session, and its pending pick.
+    """Presentation that a visitor chooses in one session, by controls and by clicks into the picture.
 
-    Callbacks only record; the rendering thread calls ``take_click`` and ``found``.
+    Callbacks only record the actions of the visitor. The rendering thread calls ``take_click`` and ``found``.
 
     Attributes:
-        chosen: white balance, up axis, scale and credit. The panel has the crop box and the exposure.
+        chosen: white balance, up axis, scale and credit. Crop box and exposure are stored in the panel.
 
     Args:
         client: viser's handle.
         panel: controls of the session.
         presentation: the saved presentation.
-        gray_world: returns the gains that make the photographs' mean gray.
-        save: writes the presentation and returns a message.
+        gray_world: function that returns white balance gains which make the mean of the photographs gray.
+        save: function that writes the presentation and returns a message.
         distance: distance of the cameras from the scene's center.
     """
 
@@ -385,20 +385,20 @@ class Presenting:
 
     @property
     def waits(self) -> bool:
-        """True if a click is pending."""
+        """True if a click has not been processed yet."""
         return self._clicked is not None
 
     @property
     def picks(self) -> bool:
-        """True if the next click is a pick."""
+        """True if the next click sets a quantity of the presentation."""
         return self._clicks.wanted
 
     def take_click(self) -> tuple[float, float] | None:
-        """Return the pending click in shares of the picture's width and height, or None."""
+        """Return the pending click as shares of the picture's width and height, or None without a click."""
         return None if self._clicked is None else self._clicked[1:]
 
     def found(self, place: SurfacePoint | None) -> None:
-        """Use the surface at the clicked pixel for the pending pick."""
+        """Set the quantity for which the visitor clicked, from the surface at the clicked pixel."""
         if self._clicked is None:
             return
         what = self._clicked[0]
@@ -425,7 +425,7 @@ class Presenting:
         self._panel.show_note(ASKS[what])
 
     def _listen(self, what: str) -> None:
-        """Start or stop receiving clicks for a quantity."""
+        """Start to receive clicks for the quantity ``what``. An empty text stops it."""
         self._picking = what
         self._clicks.want(bool(what))
 
@@ -465,7 +465,7 @@ class Presenting:
         self._panel.show_note("Up: as the cameras say" if up is None else "Up: chosen")
 
     def turn_upright(self) -> None:
-        """Align the browser's camera with the chosen up axis, if there is one."""
+        """Align the browser's camera with the chosen up axis. Without one, the camera does not move."""
         if self.chosen.up_axis is not None:
             self._client.camera.up_direction = np.array(self.chosen.up_axis)
 

@@ -1,4 +1,4 @@
-"""The scene that a viewer shows, and the drawing of its pictures."""
+"""Scene that a viewer shows, and painter of its pictures."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from polarguide.visualization.figures import (
 
 @dataclass(frozen=True, eq=False)
 class Scenery:
-    """Gaussians to be rendered: the source of a viewer's pictures.
+    """Gaussians and all other data from which a viewer renders pictures.
 
     Attributes:
         gaussians: the Gaussians.
@@ -43,8 +43,8 @@ class Scenery:
         shading: shading of the current stage.
         rasterize: rasterizer of the backend.
         sh_degree: degree of the base color's harmonics.
-        status: a line of text about it.
-        footprints: [N] footprints of a finished training, see ``raster.magnification``.
+        status: line of text that describes the run or the state of the training.
+        footprints: [N] size of a training pixel at each Gaussian of a finished training, see ``raster.magnification``.
     """
 
     gaussians: Gaussians
@@ -65,14 +65,14 @@ class Scenery:
         within: Callable[[Tensor], Tensor] | None = None,
         turn: Tensor | None = None,
     ) -> RenderResult:
-        """Render all layers, on the CPU.
+        """Render all layers, and return them on the CPU.
 
         Args:
             camera: the camera, with the size of the picture.
-            depth: whether to render depth.
-            surface: whether normals and depth are those of the surface at the pixel's median depth.
-            within: returns which places [N, 3] of the scene are shown, [N] bool; None: all.
-            turn: rotation [3, 3] of a radiance environment; None: as learned.
+            depth: render depth.
+            surface: return normals and depth of the surface at the median depth of each pixel.
+            within: function that maps points [N, 3] to a mask [N] of points to show. None shows all points.
+            turn: rotation [3, 3] of a radiance environment. None renders the environment as learned.
         """
         gaussians: Parameters = self.gaussians
         footprints = self.footprints
@@ -91,7 +91,7 @@ class Scenery:
         ).to("cpu")
 
     def stokes(self, result: RenderResult, camera: Camera) -> Tensor | None:
-        """Predict Stokes vectors, or None without both layers and a normal."""
+        """Predict Stokes vectors. Return None if the normal or one of the two radiance layers is missing."""
         if not result.is_polarized:
             return None
         return self.shading.predicted_stokes(result, camera)
@@ -120,7 +120,7 @@ def run_scenery(run: OpenedRun) -> Scenery:
 
 
 def training_scenery(loop: TrainingLoop) -> Scenery:
-    """Return the scenery of a training between two steps, with the shading of its current stage."""
+    """Return the scenery of a training between two steps. Its shading is the shading of the current stage."""
     steps = loop.settings.steps
     state = loop.state
     stage = loop.schedule.at(min(state.step, steps - 1)).stage
@@ -137,16 +137,16 @@ def training_scenery(loop: TrainingLoop) -> Scenery:
 
 
 OF_POLARIZATION = {f"{name}, measured": name for name in POLARIZED}
-"""Predicted layer by measured layer. Measured layers need pictures that determine the polarization."""
+"""Predicted layer for each measured layer. Measured layers need pictures that determine the polarization."""
 BESIDE = {
     **dict.fromkeys(("final", "base"), "photograph"),
     **{of: name for name, of in OF_POLARIZATION.items()},
 }
-"""Measured layer by rendered layer, for a wipe between the two."""
+"""Measured layer for each rendered layer. A wipe compares the two."""
 MEASURED = ("photograph", *OF_POLARIZATION, "error")
-"""Layers that exist only at a photograph's pose."""
+"""Layers that exist only at the pose of a photograph."""
 LEGEND = 0.25, 128, 512
-"""Width of the legend: share of the picture, minimum and maximum in pixels."""
+"""Width of the legend: share of the picture's width, minimum in pixels, maximum in pixels."""
 
 
 UNCHANGED = Presentation()
@@ -155,15 +155,15 @@ UNCHANGED = Presentation()
 
 @dataclass(frozen=True)
 class Appearance:
-    """A visitor's choice of a picture.
+    """Settings of a picture that a visitor chooses.
 
     Attributes:
         layer: a name in ``LAYERS``, ``POLARIZED`` or ``MEASURED``.
-        strength: factor on the specular layer. Predicted polarization is always that of the learned layers.
+        strength: factor on the specular layer. It has no effect on predicted polarization.
         turn: rotation of the far environment in degrees, counter-clockwise seen from above.
-        wipe: share of the picture's width, from the left, that shows the other run in place of the layer; without
-            another run, the measured layer (``BESIDE``) at a photograph's pose.
-        presentation: color, exposure, up axis and crop box. Without a crop box all of the scene is shown.
+        wipe: share of the picture's width, from the left, that shows the other run. Without another run, this part
+            shows the measured layer (``BESIDE``) at the pose of a photograph.
+        presentation: color, exposure, up axis and crop box. Without a crop box, the whole scene is shown.
     """
 
     layer: str = "final"
@@ -177,8 +177,8 @@ class Painter:
     """Painter of a scene's pictures.
 
     Args:
-        around: the frame of the scene's cameras.
-        beside: another run of the scene, for wipes; None: wipes show measured layers.
+        around: frame of the scene's cameras.
+        beside: another run of the scene, which wipes show. With None, wipes show measured layers.
     """
 
     def __init__(self, around: SceneFrame, beside: Scenery | None = None) -> None:
@@ -199,10 +199,10 @@ class Painter:
 
         Args:
             scenery: the scene.
-            camera: camera with the window's size; only its size counts if there is a view.
+            camera: camera with the size of the window. If there is a view, only the size is used.
             appearance: choice of the picture.
-            view: the photograph whose pose the camera has.
-            settled: whether the camera rests. Only then the range of the colors of depth is updated.
+            view: photograph at whose pose the camera is, or None for a free camera.
+            settled: True if the camera does not move. The range of the depth colors is updated only then.
 
         Returns:
             uint8 [H, W, 3] of the camera's size; None if the layer does not exist.
@@ -228,9 +228,9 @@ class Painter:
     def _wiped(
         self, picture: Picture, scenery: Scenery, camera: Camera, view: View | None, appearance: Appearance
     ) -> Picture:
-        """Draw the other run, or the measured layer, over the left part of a picture.
+        """Draw the other run or the measured layer over the left part of a picture.
 
-        Without them, return the picture.
+        Return the picture unchanged if there is neither another run nor a measured layer.
         """
         other = BESIDE.get(appearance.layer)
         left = None
@@ -268,7 +268,7 @@ class Painter:
         view: View | None,
         place: tuple[float, float],
     ) -> SurfacePoint | None:
-        """Return the surface at a place of a picture, given in shares of its width and height."""
+        """Return the surface at a position in a picture. ``place`` contains shares of width and height."""
         camera = drawn_camera(camera, view)
         result = self._result(scenery, camera, replace(appearance, layer="depth", strength=1.0, turn=0.0))
         return surface_at(result, camera, place[0] * camera.width, place[1] * camera.height)
@@ -308,7 +308,7 @@ class Painter:
     def _measured(
         self, scenery: Scenery, view: View | None, appearance: Appearance, frame_size: tuple[int, int]
     ) -> Picture | None:
-        """Draw a measured layer at a photograph's pose in a window, or return None if it is unknown."""
+        """Draw a measured layer at the pose of a photograph. Return None if the layer is unknown."""
         layer = appearance.layer
         if view is None or (layer in OF_POLARIZATION and not view.is_determined):
             return None

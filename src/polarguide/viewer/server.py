@@ -53,7 +53,7 @@ REACH = 1e4  # largest distance of a camera in units of the cameras' distance
 
 
 EVERYWHERE = ("0.0.0.0", "::")
-"""Hosts that stand for all addresses of the machine."""
+"""Hosts that mean all addresses of the machine."""
 
 
 def viewing_address(host: str, port: int) -> str:
@@ -68,19 +68,19 @@ class Viewer:
     Only ``serve`` renders, in the thread that calls it, so that a training and its viewer take turns.
 
     Args:
-        current: returns the current scene.
+        current: function that returns the current scenery.
         photographs: photographs of the scene by name, at least one; sessions start at the first one.
         shading: model of the recipe.
         trains: whether the panel can pause a training.
-        host, port: address of the server; the next free port is taken if this one is in use.
+        host, port: address of the server. If the port is in use, the next free port is taken.
         visitors: further hosts and origins that may connect.
         presentation: the saved presentation.
-        save: writes a presentation to the run and returns a message in plain text; None: browsers download it. Other
-            machines can never save.
-        paintable: materials that can be painted if nobody else can connect; None: no painting.
-        title: plain text.
-        warn: callback with the reason for closing a connection.
-        beside: another run, for wipes.
+        save: function that writes a presentation to the run and returns a message in plain text. With None, browsers
+            download the presentation. Browsers on other machines can never save.
+        paintable: materials that can be painted, or None. Painting requires that no other machine can connect.
+        title: title of the page, plain text.
+        warn: callback that receives the reason why a connection was closed.
+        beside: another run, which wipes show.
 
     Raises:
         PolarguideError: viser is not installed or has another version, or the server cannot listen at the address.
@@ -143,7 +143,7 @@ class Viewer:
 
     @property
     def paused(self) -> bool:
-        """True if a session pauses the training."""
+        """True if at least one session pauses the training."""
         with self._lock:
             return any(session.paused for session in self._sessions.values())
 
@@ -174,14 +174,14 @@ class Viewer:
 
     @functools.cached_property
     def _gray(self) -> Vector:
-        """Gains that make the photographs' mean gray."""
+        """White balance gains that make the mean of the photographs gray."""
         photographs = self._photographs.values()
         return gray_world_gains(
             [p.view for p in photographs if not p.held_out] or [p.view for p in photographs]
         )
 
     def _saved(self, presentation: Presentation) -> str:
-        """Save a presentation, also as the initial one of new sessions."""
+        """Save a presentation, and use it as the initial presentation of new sessions."""
         assert self._save is not None
         try:
             text = self._save(presentation)
@@ -193,13 +193,13 @@ class Viewer:
         return text
 
     def _control(self, name: str) -> Accepts | None:
-        """Return the validation of a control of any session. viser itself searches only the sender's controls."""
+        """Return the function that validates a control of any session, by its name in viser."""
         with self._lock:
             tables = [session.panel.accepts for session in self._sessions.values()]
         return next((table[name] for table in tables if name in table), None)
 
     def _drop(self, client_id: int, error: Exception) -> None:
-        """Close the connection of a browser. The server and a training continue."""
+        """Close the connection of a browser, while the server and the training continue."""
         with self._lock:
             removed = self._sessions.pop(client_id, None) is not None
         text = f"the viewer disconnected a browser: {type(error).__name__}: {error}"
@@ -215,10 +215,10 @@ class Viewer:
             self._sessions.pop(client.client_id, None)
 
     def serve(self, timeout: float = 0.0) -> bool:
-        """Render the picture that has been due for longest.
+        """Render the picture that has waited longest.
 
         Args:
-            timeout: longest time in seconds to wait for one.
+            timeout: longest time to wait until a picture is due, in seconds.
 
         Returns:
             True if a picture was rendered.
@@ -235,7 +235,7 @@ class Viewer:
             self._wake.wait(min(left, TICK if self._sessions else 1.0))
 
     def _draw_next(self) -> bool:
-        """Render the picture that has been due for longest, and return False if none was due."""
+        """Render the picture that has waited longest. Return False if no picture is due."""
         with self._lock:
             sessions = sorted(self._sessions.values(), key=lambda session: session.pacing.last_frame)
         for session in sessions:
@@ -252,7 +252,7 @@ class Viewer:
         return False
 
     def refresh(self) -> None:
-        """Request new pictures of a changed scene, but rarely enough not to slow a training down."""
+        """Request new pictures of a changed scene. The rate is limited, so that a training is not slowed down."""
         now = time.monotonic()
         if now - self._refreshed < max(REFRESH, SHARE * self._cost):
             return
@@ -299,12 +299,12 @@ def view_run(
     reporter: Reporter = SILENT,
     beside: OpenedRun | None = None,
 ) -> None:
-    """Serve a run to browsers: its layers from any side, next to the photographs. KeyboardInterrupt ends it.
+    """Serve a run to browsers, which show its layers from any side, until KeyboardInterrupt.
 
     Args:
         run: the run; its scene is read.
         host: address of the server.
-        port: port of the server; the next free one is taken if it is in use.
+        port: port of the server. If it is in use, the next free port is taken.
         visitors: further hosts and origins that may connect.
         reporter: receives the address.
         beside: another run of the same scene, which a wipe shows on the left.
@@ -339,7 +339,7 @@ def view_run(
 
 
 def paintable_run(run: OpenedRun) -> Paintable | None:
-    """Return the materials that can be painted over a run, or None if its recipe has no metals."""
+    """Return the materials that visitors can paint on a run, or None if its recipe has no metals."""
     if "metalness" not in run.model.shading.parameters:
         return None
     model = run.model
@@ -365,9 +365,10 @@ def paintable_run(run: OpenedRun) -> Paintable | None:
 
 
 def save_to_run(run: OpenedRun, chosen: Presentation) -> str:
-    """Write color, up axis, scale and crop box to the run's ``presentation.json``; returns a message in plain text.
+    """Write color, up axis, scale and crop box to the run's ``presentation.json``, and return a message in plain text.
 
-    Values that equal the scene's are left to the scene. The run's own credit stays.
+    A value that equals the value of the scene is not written, so that the run still inherits it. The credit of the run
+    is not changed.
     """
     own = read_presentation(run.folder)
     above = read_presentation(run.scene_folder)
@@ -394,10 +395,10 @@ def watched(
     visitors: VisitorOptions = VisitorOptions(),
     reporter: Reporter = SILENT,
 ) -> Iterator[Look]:
-    """Open a viewer for a training; yields the function to call between steps.
+    """Open a viewer for a training. The context yields the function that the training calls between steps.
 
     Raises:
-        PolarguideError: several processes train, or the server cannot listen at the address.
+        PolarguideError: the training has several processes, or the server cannot listen at the address.
     """
     if loop.ranks.world > 1:
         raise PolarguideError(
@@ -433,7 +434,7 @@ def watched(
 def _opened(
     current: Callable[[], Scenery], scene: Scene, reporter: Reporter, host: str, *, name: str, **options: Any
 ) -> Iterator[Viewer]:
-    """Open a viewer, report its address, and warn about other machines.
+    """Open a viewer, report its address, and warn if other machines can connect.
 
     Args:
         current, scene, reporter, host, name: the scene, its name, and the address.
@@ -454,7 +455,7 @@ def _opened(
 
 
 def from_elsewhere(host: str, port: int) -> list[str]:
-    """Return lines with the address for other machines, and with a private tunnel."""
+    """Return lines with the address for other machines, and with the command for a private tunnel."""
     here = network_address() if host in EVERYWHERE else host
     lines = [] if here is None else [f"from other machines: {viewing_address(here, port)}"]
     tunnel = shlex.join(["ssh", "-L", f"{port}:127.0.0.1:{port}", here or platform.node()])

@@ -1,4 +1,4 @@
-"""A session of the viewer: one connected browser with its controls, camera and pictures."""
+"""Session of the viewer: one connected browser with its controls, camera and pictures."""
 
 from __future__ import annotations
 
@@ -40,12 +40,14 @@ GREATEST_WIDTH = 3840
 
 
 class FramePacing:
-    """Schedule of pictures: coarse ones while the camera or a control changes, a sharp one afterwards.
+    """Schedule of a session's pictures.
+
+    While the camera or a control changes, pictures are coarse. Afterwards one sharp picture is due.
 
     The height of coarse pictures adapts to their rendering time. Times are seconds of one monotonic clock.
 
     Attributes:
-        version: number of changes so far, which the next picture shows.
+        version: number of changes so far. The next picture shows all of them.
     """
 
     def __init__(self) -> None:
@@ -61,7 +63,7 @@ class FramePacing:
         self.version += 1
 
     def mark_outdated(self) -> None:
-        """Record a change of the scene: a sharp picture is due, without coarse ones before it."""
+        """Record a change of the scene. A sharp picture is then due, without coarse pictures before it."""
         self.version += 1
 
     def due(self, now: float) -> str | None:
@@ -104,21 +106,22 @@ def _raise(error: Exception) -> None:
 
 
 class Session:
-    """A connected browser.
+    """Connected browser with its controls, camera and pictures.
 
-    Callbacks only record changes; the rendering thread calls ``draw``.
+    Callbacks only record changes. The rendering thread calls ``draw``.
 
     Args:
         client: viser's handle.
         photographs: photographs by name.
         scene_frame: frame of the scene.
         options: options of the panel.
-        wake: callback when a picture may be due.
-        gray_world: returns the gains that make the photographs' mean gray.
-        save: writes a presentation to the run and returns a message; None: the browser downloads it.
+        wake: callback that is called when a picture may be due.
+        gray_world: function that returns white balance gains which make the mean of the photographs gray.
+        save: function that writes a presentation to the run and returns a message. With None, the browser downloads the
+            presentation.
         paintable: materials that can be painted.
-        drop: callback with the exception of another callback, to close the connection.
-        beside: another run, for wipes.
+        drop: callback that receives the exception of another callback and closes the connection.
+        beside: another run, which wipes show.
     """
 
     def __init__(
@@ -191,7 +194,7 @@ class Session:
 
     @property
     def client_id(self) -> int:
-        """Number of the browser in viser."""
+        """Number by which viser identifies the browser."""
         return int(self._client.client_id)
 
     @property
@@ -200,7 +203,7 @@ class Session:
         return bool(self.panel["pause"].value)
 
     def _soon_again(self, what: str) -> bool:
-        """Return whether the same was requested less than ``BETWEEN_FILES`` ago, and record the request otherwise."""
+        """Return True if a request came less than ``BETWEEN_FILES`` after the last one of its kind; else record it."""
         now = time.monotonic()
         with self._lock:
             soon = now - self._written_at.get(what, -BETWEEN_FILES) < BETWEEN_FILES

@@ -1,1 +1,1 @@
-"""Arrays to 8-bit pictures: false colors, contact sheets, layers, pictures inside a page."""
+"""Conversion of arrays to 8-bit pictures: false colors, contact sheets, layers, and pictures in web pages."""

@@ -1,4 +1,4 @@
-"""8-bit pictures, uint8 RGB [H, W, 3], of arrays and layers: false colors, PNG files and contact sheets."""
+"""Conversion of arrays and layers to 8-bit pictures: false colors, contact sheets and PNG files."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ FONT_SIZE = 18
 SMALLEST_FONT_SIZE = 10
 LINE_HEIGHT = 28
 READ_AT = 384
-"""Width of a tile up to which the font size is constant. Larger tiles have larger type."""
+"""Largest width of a tile with the smallest font size. Wider tiles have larger text."""
 
 
 def contact_sheet(
@@ -50,15 +50,15 @@ def contact_sheet(
 ) -> Picture:
     """Arrange pictures in rows and columns on white, with labels on top and to the left.
 
-    All tiles have one size. Small pictures are enlarged by an integer factor without smoothing to at least
-    ``minimum_width``. Large pictures are reduced to ``maximum_width`` by area averages. A picture of another
-    size is fitted into its tile and centered.
+    All tiles have the same size. Small pictures are enlarged to at least ``minimum_width`` by an integer factor without
+    smoothing. Large pictures are reduced to ``maximum_width`` by area averages. A picture with another aspect ratio is
+    fitted into its tile and centered.
 
     Args:
-        rows: the pictures, uint8 RGB [H, W, 3]. None and the end of a short row leave a tile blank.
+        rows: the pictures, uint8 RGB [H, W, 3]. A tile stays blank for None and after the end of a short row.
         row_labels: one per row.
         column_labels: one per column. Characters outside ASCII are drawn as "?".
-        footer: pictures below the columns, such as scales, scaled to the width of a tile.
+        footer: pictures below the columns, such as color scales. They are scaled to the width of a tile.
         minimum_width, maximum_width: bounds of a tile's width in pixels.
         gutter: pixels between tiles and around the sheet.
         caption: a line of text at the bottom.
@@ -115,7 +115,7 @@ def contact_sheet(
 
 
 def _height_at(width: int, pictures: Sequence[Picture | None]) -> int:
-    """Return the height of the tallest of some pictures at a width."""
+    """Return the height of the tallest picture after all pictures are scaled to a common width."""
     return max(1, max(round(width * p.shape[0] / p.shape[1]) for p in pictures if p is not None))
 
 
@@ -135,7 +135,7 @@ def _place(sheet: Image.Image, picture: Picture, tile: tuple[int, int, int, int]
 
 
 def _write(sheet: Image.Image, text: str, x: int, y: int, width: int, larger: float) -> None:
-    """Draw text centered in ``width`` pixels from ``x`` on the line ``y``, with a smaller font if necessary.
+    """Draw text in the ``width`` pixels to the right of ``x``, centered, with a smaller font if necessary.
 
     Args:
         larger: scale of the font size.
@@ -157,14 +157,15 @@ NOTHING: Mapping[str, str] = MappingProxyType({})
 
 
 def radiance_to_rgb(linear: Tensor) -> Picture:
-    """Convert linear radiance [H, W, 3] to a displayed picture: clipped to [0, 1], sRGB. NaN is black."""
+    """Clip linear radiance [H, W, 3] to [0, 1] and encode it as an sRGB picture. NaN becomes black."""
     return _to_uint8(shown(linear.detach().nan_to_num(nan=0.0)))
 
 
 def normal_to_rgb(normals_world: Tensor, camera: Camera) -> Picture:
-    """Convert world normals to the usual colors: camera-space (x, -y, -z) from [-1, 1] to [0, 255].
+    """Convert world normals to the usual colors, in camera space.
 
-    Right is red, up is green, toward the camera is blue.
+    Normals to the right are red, upward normals are green, and normals toward the camera are blue. The components (x,
+    -y, -z) are mapped from [-1, 1] to [0, 255].
 
     Args:
         normals_world: [H, W, 3] of any length.
@@ -190,7 +191,7 @@ def scalar_to_rgb(
 
     Args:
         values: [H, W].
-        low, high: values at the ends of the color map, ``low < high``. Colors saturate outside.
+        low, high: values at the ends of the color map, ``low < high``. Values outside have the color of the nearer end.
         colormap: a name in ``COLOR_MAPS``.
 
     Returns:
@@ -219,8 +220,8 @@ def aolp_to_rgb(aolp: Tensor, dolp: Tensor | None = None) -> Picture:
 
     Args:
         aolp: [H, W] radians, modulo pi.
-        dolp: [H, W] in [0, 1], used as brightness so that the noise of unpolarized pixels stays dark; None
-            for full brightness.
+        dolp: [H, W] in [0, 1], used as brightness, so that the noisy angles of unpolarized pixels are dark. None draws
+            all pixels at full brightness.
 
     Returns:
         uint8 [H, W, 3]; black for values that are not finite.
@@ -238,20 +239,21 @@ def aolp_to_rgb(aolp: Tensor, dolp: Tensor | None = None) -> Picture:
 
 
 LARGE_ERROR = 0.25
-"""Error of full brightness."""
+"""Error that is drawn at full brightness."""
 
 
 def error_to_rgb(pred_linear: Tensor, true_linear: Tensor, high: float = LARGE_ERROR) -> Picture:
-    """Convert the absolute difference of displayed pictures, mean over channels, to colors from 0 to ``high``."""
+    """Convert the difference of displayed pictures, averaged over channels, to colors from 0 to ``high``."""
     true = shown(true_linear.detach().cpu())
     return scalar_to_rgb((shown(pred_linear.detach().cpu()) - true).abs().mean(-1), 0.0, high, "inferno")
 
 
 def scale_bar(low: float, high: float, colormap: str, unit: str = "", *, middle: str = "") -> Picture:
-    """Draw the color scale of ``scalar_to_rgb`` with both limits below: uint8 RGB [44, 256, 3].
+    """Draw the color scale of ``scalar_to_rgb`` with labels for both limits, uint8 RGB [44, 256, 3].
 
     Args:
-        unit: unit of the limits. middle: label at the middle of the bar.
+        unit: unit of the limits.
+        middle: label at the middle of the bar.
     """
     ramp = torch.linspace(low, high, 256).expand(22, -1)
     end = f"{high:g} {unit}".rstrip()
@@ -259,9 +261,9 @@ def scale_bar(low: float, high: float, colormap: str, unit: str = "", *, middle:
 
 
 def angle_wheel(scale: float = 1.0) -> Picture:
-    """Draw the colors of ``aolp_to_rgb`` by the direction of the field: [110, 256, 3].
+    """Draw a wheel with the color of each AoLP in ``aolp_to_rgb``, [110, 256, 3].
 
-    The center is dark like a small DoLP.
+    The center is dark, as for a small DoLP.
 
     Args:
         scale: factor on the size.
@@ -300,12 +302,12 @@ def normal_ball(high: int = 64, width: int = 256) -> Picture:
 
 
 def shares_to_rgb(shares: Tensor) -> Picture:
-    """Convert red, green and blue [H, W, 3] from 0 to 1 without a transfer; mid gray where not finite."""
+    """Convert values [H, W, 3] in [0, 1] to RGB without sRGB encoding. Values that are not finite become mid gray."""
     return _to_uint8(shares.detach().nan_to_num(0.5, 0.5, 0.5))
 
 
 def with_key(picture: Picture, key: Picture, width: int) -> Picture:
-    """Draw a legend of ``width`` pixels over the lower left corner of a picture, on a white border."""
+    """Draw a legend, scaled to ``width`` pixels and with a white border, over the lower left corner of a picture."""
     scale = width / key.shape[1]
     way = cv2.INTER_AREA if scale < 1 else cv2.INTER_LINEAR
     drawn_on = np.flatnonzero((key != BACKGROUND).any(axis=(0, 2)))
@@ -321,7 +323,7 @@ def with_key(picture: Picture, key: Picture, width: int) -> Picture:
 
 
 def with_name(picture: Picture, name: str) -> Picture:
-    """Draw a name into the upper left corner of a picture, white on a dark rim."""
+    """Draw a name into the upper left corner of a picture, in white with a dark outline."""
     size = min(picture.shape[:2])
     image = Image.fromarray(picture)
     font = ImageFont.load_default(size / 16)
@@ -332,7 +334,7 @@ def with_name(picture: Picture, name: str) -> Picture:
 
 
 def color_patch(color: int, text: str) -> Picture:
-    """Draw a patch of a gray from 0 to 255 with a label below: uint8 RGB [44, 256, 3]."""
+    """Draw a patch of a gray level (0 to 255) with a label below, uint8 RGB [44, 256, 3]."""
     return _bar(np.full((22, 256, 3), color, np.uint8), text)
 
 
@@ -375,7 +377,7 @@ def png_bytes(rgb8: Picture, alpha8: Picture | None = None, about: Mapping[str, 
 
 
 def _to_uint8(values: Tensor) -> Picture:
-    """Convert [0, 1] to [0, 255], rounded half up, so that the middle is 128."""
+    """Convert values in [0, 1] to bytes. Halves are rounded up, so 0.5 becomes 128."""
     scaled = torch.floor(values.to("cpu", torch.float64) * 255 + 0.5)
     return scaled.clamp(0, 255).to(torch.uint8).numpy()
 
@@ -388,18 +390,18 @@ def color_gradient(color_map: str) -> str:
 
 
 RADIANCE = frozenset(("final", "base", "reflection", "specular", "diffuse"))
-"""Layers that are linear radiance."""
+"""Layers that contain linear radiance."""
 
 
 DOLP_HIGH = 0.5
-"""DoLP of full brightness. Dielectrics exceed it near Brewster's angle only."""
+"""DoLP that is drawn at full brightness. Dielectrics exceed it only near Brewster's angle."""
 AOLP_FULL_DOLP = 0.1
-"""DoLP above which the AoLP has full brightness. Below it, noise dominates the angle."""
+"""DoLP above which the AoLP is drawn at full brightness. At a lower DoLP, noise dominates the angle."""
 STOKES_HIGH = 0.5
-"""S1 / S0 and S2 / S0 of full color."""
+"""Absolute value of S1 / S0 and of S2 / S0 that is drawn in full color."""
 _SHARES = ("strength", "roughness", "metalness", "alpha")
 Depths = tuple[float, float]
-"""Nearest and farthest depth of a color scale."""
+"""Smallest and largest depth of a color scale."""
 
 
 def layer_picture(
@@ -414,9 +416,9 @@ def layer_picture(
     """Return a layer as an 8-bit picture, or None if the recipe lacks it.
 
     Args:
-        result, camera: the rendering.
+        result, camera: the rendering and its camera.
         name: name of the layer.
-        depths: range of the colors of depth.
+        depths: depths at the ends of the color scale of the layer depth.
         exposed: darken radiance so that at most 1 % of the pixels clip.
         color: color matrix of the presentation, [3, 3], for layers of radiance.
     """
@@ -438,9 +440,10 @@ def layer_picture(
 
 
 def polarization_picture(name: str, stokes: Tensor) -> Picture:
-    """Return Stokes vectors [3, H, W, C], predicted or measured, as one of ``POLARIZED``, by their luminance.
+    """Convert the luminance of Stokes vectors [3, H, W, C] to the picture that ``name``, one of ``POLARIZED``, selects.
 
-    ``stokes``: S1 / S0 in red and S2 / S0 in green, mid gray at 0.
+    The vectors are predicted or measured. The picture ``stokes`` shows S1 / S0 in red and S2 / S0 in green, with mid
+    gray at 0.
     """
     gray = optics.luminance(stokes)
     degree = optics.dolp(gray)
@@ -454,14 +457,17 @@ def polarization_picture(name: str, stokes: Tensor) -> Picture:
 
 
 def depth_picture(depth: Tensor, depths: Depths) -> Picture:
-    """Return depths [H, W] in colors on a logarithmic scale; black without a depth."""
+    """Convert depths [H, W] to colors on a logarithmic scale. Pixels without a depth are black."""
     near, far = (math.log(end) for end in depths)
     logs = torch.where(depth > 0, depth.double().clamp(min=1e-12).log(), math.nan)
     return scalar_to_rgb(logs, near, far)
 
 
 def layer_scale(name: str, depths: Depths | None = None) -> Picture | None:
-    """Return the legend of a layer, 256 pixels wide, or None for radiance, and for depth without a range."""
+    """Return the legend of a layer, 256 pixels wide.
+
+    Return None for radiance, which needs no legend, and for depth if ``depths`` is None.
+    """
     name = name.partition(",")[0]
     if name in _SHARES:
         return scale_bar(0.0, 1.0, "viridis")
@@ -478,18 +484,21 @@ def layer_scale(name: str, depths: Depths | None = None) -> Picture | None:
 
 
 def clipping_exposure(values: Tensor) -> float:
-    """Return the factor, at most 1, with which under 1 % of the pixels of radiance [H, W, 3] exceed 1."""
+    """Return the largest factor, at most 1, with which under 1 % of the pixels of radiance [H, W, 3] exceed 1."""
     brightest = values.detach().nan_to_num(0.0, 0.0, 0.0).amax(dim=-1).flatten().sort().values
     limit = float(brightest[max(0, brightest.numel() - 1 - brightest.numel() // 128)])
     return min(1.0, 1.0 / limit) if limit > 0 else 1.0
 
 
 _SAMPLES = 1_000_000
-"""Largest number of depths to sort. PyTorch accepts at most 16 million."""
+"""Largest number of depths from which quantiles are computed. PyTorch accepts at most 16 million."""
 
 
 def depth_range(depth: Tensor, mask: Tensor) -> Depths:
-    """Return the range of depths where ``mask``, of one shape, without 2 % on either side."""
+    """Return the range of the masked depths without the nearest 2 % and the farthest 2 %.
+
+    ``depth`` and ``mask`` have the same shape.
+    """
     values = depth[mask & (depth > 0)]
     if values.numel() == 0:
         return 1.0, 2.0
@@ -499,13 +508,13 @@ def depth_range(depth: Tensor, mask: Tensor) -> Depths:
 
 
 def true_depths(view: View) -> Tensor | None:
-    """Return the true depths of a view's surfaces, 0 without a surface; None: unknown."""
+    """Return the true depths of a view, with 0 at pixels without a surface. Return None if they are unknown."""
     truth = view.ground_truth
     return None if truth is None or truth.depth is None else truth.depth
 
 
 def true_name(name: str) -> str:
-    """Return the name of a layer's ground truth: the photograph for the final layer."""
+    """Return the name of a layer's ground truth. The ground truth of the final layer is the photograph."""
     return "photograph" if name == "final" else f"{name}, true"
 
 
@@ -514,8 +523,8 @@ def reference_pictures(
 ) -> dict[str, Picture]:
     """Return reference pictures of a view's layers, 8-bit.
 
-    They are the ``photograph``, the ground truth of other layers as ``NAME, true``, and the measured
-    polarization as ``NAME, measured``.
+    The result contains the photograph as ``photograph``, the ground truth of other layers as ``NAME, true``, and
+    measured polarization as ``NAME, measured``.
 
     Args:
         color, depths: see ``layer_picture``.
@@ -534,7 +543,7 @@ def ground_truth_pictures(
 ) -> dict[str, Picture]:
     """Return the photograph as ``final`` and the ground truth of other layers as 8-bit pictures.
 
-    Depth needs ``depths``.
+    The result contains depth only if ``depths`` is specified.
     """
     pictures = {"final": radiance_to_rgb(colored(view.photograph(), color))}
     ground_truth = view.ground_truth

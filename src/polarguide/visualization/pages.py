@@ -1,6 +1,6 @@
 """Self-contained HTML pages and SVG files from the templates in the ``page`` folders of packages.
 
-Their pictures are data URIs with a limited size.
+Pictures in pages are data URIs with a limited size.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from PIL import Image
 from polarguide.visualization.figures import Picture, check_picture
 
 BASE = "polarguide.visualization"
-"""Package whose folder ``page`` has the common templates ``base.html`` and ``chart.svg``."""
+"""Package whose folder ``page`` contains the common templates ``base.html`` and ``chart.svg``."""
 
 
 @lru_cache
 def templates(package: str) -> Environment:
-    """Return the templates of a package's folder ``page`` and the common ones. Texts in HTML and SVG are escaped."""
+    """Load the common templates and those in a package's folder ``page``. Values in HTML and SVG are escaped."""
     environment = Environment(
         loader=ChoiceLoader([PackageLoader(package, "page"), PackageLoader(BASE, "page")]),
         autoescape=select_autoescape(["html", "svg"]),
@@ -48,7 +48,8 @@ def page(package: str, name: str, *, script: str = "", more: str = "", **values:
     """Render an HTML page from a template that extends ``base.html``.
 
     Args:
-        package, name: the template. script: content of the page's script element; empty forbids scripts.
+        package, name: the template.
+        script: content of the page's script element; empty forbids scripts.
         more: additional sources of scripts; further directives follow a semicolon.
         values: values of the template, at least ``title``.
     """
@@ -60,13 +61,13 @@ def page(package: str, name: str, *, script: str = "", more: str = "", **values:
 
 
 def script_json(data: Any) -> str:
-    """Return JSON that cannot end its script element."""
+    """Return JSON that is safe inside a script element of a page."""
     text = json.dumps(data, allow_nan=False)
     return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 
 
 def content_policy(script: str = "", *, more: str = "") -> str:
-    """Return the content policy of a page without requests: it allows inline pictures, styles and one script.
+    """Return a content policy that allows only inline pictures, styles and one script, and no requests.
 
     Args:
         script: content of the page's script element; empty forbids scripts.
@@ -88,13 +89,13 @@ LAYERS: dict[str, str] = {
     "normal_error": "normal error",
     "metalness": "metalness",
 }
-"""Layers of the report in order: key and label."""
+"""Layers that the report shows, in order, with key and label."""
 LOSSLESS = ("normal",)
 JPEG_QUALITY = 90
 
 
 def data_uri(picture: Picture, layer: str, side: int) -> str:
-    """Return a picture uint8 RGB [H, W, 3] as a data URI, reduced to ``side`` pixels at its longer side."""
+    """Encode a picture uint8 RGB [H, W, 3] as a data URI. Its longer side is reduced to ``side`` pixels."""
     check_picture(picture, layer)
     factor = min(1.0, side / max(picture.shape[:2]))
     size = [max(1, round(factor * length)) for length in (picture.shape[1], picture.shape[0])]

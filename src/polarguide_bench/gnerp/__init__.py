@@ -1,1 +1,1 @@
-"""Neural fields in plain torch: GNeRP (Li et al. 2024), a signed-distance field trained with polarization."""
+"""GNeRP (Li et al. 2024) in PyTorch: a neural signed-distance field that is trained with polarization."""

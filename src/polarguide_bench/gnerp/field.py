@@ -1,8 +1,8 @@
 """Fields of signed distance, color and background, in the region that the cameras surround.
 
-``GridField`` has dense grids. ``NetworkField`` has the networks of the publication: distance 8 x 256, radiance 4 x 256
-(GNeRP after NeuS; initialization of Gropp et al. 2020). It needs a GPU, because a step differentiates the distance
-twice.
+``GridField`` consists of dense grids. ``NetworkField`` consists of the networks of the publication. Its distance
+network has 8 layers of width 256, its radiance network 4 layers of width 256 (GNeRP after NeuS; initialization of Gropp
+et al. 2020). It is practical only on a GPU, because a step differentiates the distance twice.
 """
 
 from __future__ import annotations
@@ -25,18 +25,18 @@ from polarguide_bench.gnerp.grids import FeatureGrids, SmoothGrids, spline_matri
 from polarguide_bench.gnerp.recipe import FieldShape
 
 MARGIN = 1.02
-"""Radius of the region over the distance of the farthest camera."""
+"""Ratio of the region's radius to the distance of the farthest camera."""
 
 
 @dataclass(frozen=True)
 class Region:
-    """The sphere around the subject that contains the cameras, with its unit of length.
+    """Sphere around the subject that contains the cameras. It defines the coordinates of a field.
 
     Attributes:
-        center: center [3] in the world.
-        unit: half the side of the middle cube in world units, which is half the width of a picture at the center. Grids
-            have their full resolution in this cube.
-        radius: radius of the sphere in this unit, at least 1.
+        center: [3] center of the sphere in world coordinates.
+        unit: unit of length of the coordinates, in world units. It is half the width of a picture at the center. Grids
+            have their full resolution in the cube from -1 to 1 in these coordinates.
+        radius: radius of the sphere in this unit of length, at least 1.
     """
 
     center: tuple[float, float, float]
@@ -45,7 +45,7 @@ class Region:
 
     @classmethod
     def around(cls, cameras: Sequence[Camera]) -> Region:
-        """Return the region of the cameras of a training. The unit is the median of their units."""
+        """Create the region around the cameras of a training. Its unit is the median of the units of all cameras."""
         frame = scene_frame(cameras)
         distances = [float((camera.center - frame.center).norm()) for camera in cameras]
         unit = median(
@@ -56,7 +56,7 @@ class Region:
         return cls((x, y, z), unit, max(1.0, MARGIN * max(distances) / unit))
 
     def first_radius(self, radius: float) -> float:
-        """Return the radius of the initial sphere, clamped to keep a distance from the cameras.
+        """Return the radius of the initial surface, a sphere, clamped so that it stays away from the cameras.
 
         Args:
             radius: requested radius in the region's unit.
@@ -68,10 +68,11 @@ class Region:
         return (points - points.new_tensor(self.center)) / self.unit
 
     def cube(self, inner: Tensor) -> tuple[Tensor, Tensor]:
-        """Map coordinates [..., 3] of the field to the grids' cube [-1, 1]^3, and return the derivatives [..., 3].
+        """Map coordinates [..., 3] of the field to the cube [-1, 1]^3 of the grids; return also the derivatives [...,
+        3].
 
-        Beyond 1, each axis continues as ``2 - 1/x``. This is the contraction of Mip-NeRF 360 (Barron et al. 2022) along
-        each axis, so gradients are also converted along each axis.
+        Coordinates beyond 1 are contracted by ``2 - 1/x``, separately along each axis. Mip-NeRF 360 (Barron et al.
+        2022) contracts the radius in this way. Gradients are also converted separately along each axis.
         """
         size = inner.abs()
         outside = size.clamp(min=1)
@@ -80,17 +81,17 @@ class Region:
         return place, 1 / (outside * outside * end)
 
     def places(self, cube: Tensor) -> Tensor:
-        """Invert ``cube`` along one axis: return coordinates [...] of the field for places in the grids."""
+        """Invert ``cube`` along one axis: convert positions in the grids to coordinates [...] of the field."""
         along = cube * (2 - 1 / self.radius)
         return torch.where(along.abs() > 1, along.sign() / (2 - along.abs()), along)
 
     def surroundings(self, inner: Tensor) -> Tensor:
-        """Map coordinates [..., 3] beyond the sphere to the ball of radius 1 of the background's grids."""
+        """Map coordinates [..., 3] outside the sphere to the ball of radius 1 in which the background's grids are defined."""
         distance = inner.norm(dim=-1, keepdim=True).clamp(min=self.radius)
         return inner / distance * (1 - 0.5 * self.radius / distance)
 
     def span(self, origin: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the distances [N] at which rays enter and leave the sphere. Both are equal for a miss.
+        """Return the distances [N] at which rays enter and leave the sphere. Both are equal if a ray misses it.
 
         Args:
             origin: [N, 3] in coordinates of the field.
@@ -103,17 +104,17 @@ class Region:
 
 
 SHARPENING = 10.0
-"""Scale of the learned logarithm of the sharpness, exp(10 v) (NeuS, Wang et al. 2021)."""
+"""Factor 10 in the sharpness exp(10 v), in which v is learned (NeuS, Wang et al. 2021)."""
 FREQUENCIES = 4
-"""Frequencies of encoded directions."""
+"""Number of frequencies in the encoding of directions."""
 DIRECTION_WIDTH = 3 * (1 + 2 * FREQUENCIES)
-"""Width of an encoded direction."""
+"""Number of values of an encoded direction."""
 MAP_SIDE = 129
-"""Nodes along a side of the map of distances."""
+"""Number of nodes along a side of the coarse map of distances."""
 
 
 class Geometry(NamedTuple):
-    """Signed distance [N] of N places (positive outside), its gradient [N, 3], and features [N, F]."""
+    """Signed distance [N] at N points (positive outside), its gradient [N, 3], and features [N, F]."""
 
     distance: Tensor
     slope: Tensor
@@ -121,15 +122,17 @@ class Geometry(NamedTuple):
 
 
 class Field(nn.Module):
-    """A field that rays sample, in coordinates of a ``Region``: lengths in its unit, the origin at its center.
+    """Field of signed distance and color, which rays sample.
+
+    Its coordinates are relative to the center of a ``Region`` and in the region's unit of length.
 
     Attributes:
         region: the region.
-        log_sharpness: learned ln(s) / 10 of the density's logistic function.
-        first_log_sharpness: its initial value.
-        direction_share: weight of the encoded direction in the color at this step, in [0, 1].
-        distances: map of the distances in the region's cube at an earlier step. Rays use it to skip empty space.
-        head: network of the color.
+        log_sharpness: learned ln(s) / 10. s is the sharpness of the logistic function that defines density.
+        first_log_sharpness: initial value of ``log_sharpness``.
+        direction_share: weight of the direction in the color network at the current step, in [0, 1].
+        distances: coarse map of the distances at an earlier step. Rays use it to skip empty space.
+        head: network that computes the color.
     """
 
     map_side = MAP_SIDE
@@ -149,11 +152,11 @@ class Field(nn.Module):
 
     @abstractmethod
     def geometry(self, places: Tensor) -> Geometry:
-        """Return the geometry at places [N, 3], differentiable in all parameters."""
+        """Compute the geometry at positions [N, 3], differentiable in all parameters."""
 
     @abstractmethod
     def lattice(self, axes: Sequence[Tensor]) -> Tensor:
-        """Return distances [X, Y, Z] at all combinations of coordinates [X], [Y] and [Z], without a gradient."""
+        """Compute distances [X, Y, Z] at all combinations of coordinates [X], [Y] and [Z], without a gradient."""
 
     def color(self, places: Tensor, directions: Tensor, normals: Tensor, features: Tensor) -> Tensor:
         """Return display colors [N, 3] in [0, 1] along rays of these directions."""
@@ -172,7 +175,7 @@ class Field(nn.Module):
         return (SHARPENING * self.log_sharpness).exp()
 
     def near_distance(self, places: Tensor) -> Tensor:
-        """Interpolate distances [...] at places [..., 3] in the map."""
+        """Interpolate distances [...] at positions [..., 3] from the coarse map."""
         cube, _ = self.region.cube(places)
         # The map's axes are x, y, z. grid_sample counts them from the last.
         grid = cube.reshape(1, 1, 1, -1, 3).flip(-1)
@@ -180,7 +183,7 @@ class Field(nn.Module):
 
 
 class GridField(Field):
-    """A field of dense grids over the region's cube, with a small head for the color.
+    """Field of dense grids over the cube of the region, with a small network for the color.
 
     Args:
         region: the region.
@@ -220,7 +223,7 @@ class GridField(Field):
 
 
 class Background(nn.Module):
-    """Density and color beyond the cameras' sphere, in grids over direction and inverse distance.
+    """Density and color outside the sphere of the cameras, in grids over direction and inverse distance.
 
     Args:
         shape: sizes of grids and networks.
@@ -233,13 +236,13 @@ class Background(nn.Module):
         self.head = network((self.grids.width, shape.width, 4), generator)
 
     def forward(self, places: Tensor) -> tuple[Tensor, Tensor]:
-        """Return density [N] and display colors [N, 3] at places in a ball of radius 1 (``Region.surroundings``)."""
+        """Compute density [N] and display colors [N, 3] at positions in a ball of radius 1 (``Region.surroundings``)."""
         values = self.head(self.grids(places))
         return softplus(values[:, 0]), torch.sigmoid(values[:, 1:])
 
 
 def network(widths: Sequence[int], generator: torch.Generator) -> nn.Sequential:
-    """Create linear layers of these widths with ReLUs between them, initialized as in He et al. (2015)."""
+    """Create linear layers of the given widths with ReLUs between them, initialized as in He et al. (2015)."""
     layers: list[nn.Module] = []
     for inputs, outputs in pairwise(widths):
         layer = nn.Linear(inputs, outputs)
@@ -251,29 +254,29 @@ def network(widths: Sequence[int], generator: torch.Generator) -> nn.Sequential:
 
 
 def encoded(values: Tensor, frequencies: int) -> Tensor:
-    """Append sine and cosine of the values [N, D] times 1, 2, 4, ...: [N, D (1 + 2 F)]."""
+    """Encode values [N, D] by themselves and by sine and cosine of F multiples (1, 2, 4, ...), [N, D (1 + 2 F)]."""
     scaled = [2**k * values for k in range(frequencies)]
     return torch.cat((values, *(f(each) for each in scaled for f in (torch.sin, torch.cos))), dim=-1)
 
 
 DEPTH = 8
-"""Hidden layers of the distance network."""
+"""Number of hidden layers of the distance network."""
 WIDTH = 256
-"""Width of the networks' layers."""
+"""Number of units in each hidden layer of the networks."""
 SKIP = 4
-"""Layer with a skip connection from the input."""
+"""Index of the layer that also receives the input by a skip connection."""
 PLACE_FREQUENCIES = 8
-"""Frequencies of encoded places."""
+"""Number of frequencies in the encoding of positions."""
 PLACE_WIDTH = 3 * (1 + 2 * PLACE_FREQUENCIES)
-"""Width of an encoded place."""
+"""Number of values of an encoded position."""
 SOFTNESS = 100.0
 """Softplus parameter of the distance network."""
 CHUNK = 1 << 16
-"""Batch size of a lattice, in places."""
+"""Number of lattice points that are evaluated in one batch."""
 
 
 class NetworkField(Field):
-    """A field of two networks: distance with a skip connection, and color.
+    """Field of two networks: one with a skip connection for the distance, and one for the color.
 
     Args:
         region: the region.
@@ -306,7 +309,10 @@ class NetworkField(Field):
         return torch.cat(distances).view(places.shape[:-1])
 
     def _distance(self, places: Tensor) -> Tensor:
-        """Return distance and features [N, 1 + WIDTH] at places [N, 3]. The network works in a sphere of radius 1."""
+        """Compute distance and features [N, 1 + WIDTH] at positions [N, 3].
+
+        Positions are scaled to a sphere of radius 1 for the network.
+        """
         encoding = encoded(places / self.region.radius, PLACE_FREQUENCIES)
         hidden = encoding
         for k, layer in enumerate(self.layers):
@@ -319,7 +325,7 @@ class NetworkField(Field):
 
 
 def _distance_layers(radius: float, generator: torch.Generator) -> nn.ModuleList:
-    """Create layers that begin as the distance of a sphere (Gropp et al. 2020), positive outside."""
+    """Create layers whose initial output is the signed distance of a sphere (Gropp et al. 2020), positive outside."""
     layers = []
     widths = [PLACE_WIDTH, *[WIDTH] * DEPTH, WIDTH + 1]
     for k, (inputs, outputs) in enumerate(pairwise(widths)):

@@ -1,7 +1,7 @@
-"""Dense grids over a cube, one for each resolution. Their interpolated values are linear in their parameters.
+"""Dense grids over a cube at several resolutions, whose interpolated values are linear in their parameters.
 
-Value and gradient of a grid at a point are weighted sums of the same few nodes. A loss on gradients (on normals)
-therefore reaches the nodes without a second derivative.
+Value and gradient of a grid at a point are weighted sums of the same few nodes. So the gradient of a loss on normals is
+computed without second derivatives.
 """
 
 from __future__ import annotations
@@ -36,10 +36,11 @@ class _Gather(torch.autograd.Function):
 
 
 class SmoothGrids(nn.Module):
-    """A scalar as a sum of quadratic B-splines on several grids, once continuously differentiable, initially zero.
+    """Scalar function: a sum of quadratic B-splines on several grids. It has a continuous gradient and is initially
+    zero.
 
     Args:
-        resolutions: cells of each grid along a side of the cube [-1, 1]^3.
+        resolutions: number of cells of each grid along a side of the cube [-1, 1]^3.
     """
 
     def __init__(self, resolutions: Sequence[int]) -> None:
@@ -48,7 +49,7 @@ class SmoothGrids(nn.Module):
         self.levels = nn.ParameterList(torch.zeros((n + 2) ** 3, 1) for n in resolutions)
 
     def forward(self, places: Tensor) -> tuple[Tensor, Tensor]:
-        """Return values [N] and gradients [N, 3] at places [N, 3]. Places are clamped to the cube."""
+        """Compute values [N] and gradients [N, 3] at positions [N, 3], which are clamped to the cube."""
         sums = torch.zeros(len(places), 4, 1, dtype=places.dtype, device=places.device)
         for resolution, table in zip(self.resolutions, self.levels, strict=True):
             sums = sums + _Gather.apply(table, *spline_weights(places, resolution))
@@ -56,12 +57,12 @@ class SmoothGrids(nn.Module):
 
 
 class FeatureGrids(nn.Module):
-    """Features as concatenated trilinear interpolations on several grids.
+    """Features, which are trilinear interpolations on several grids, concatenated.
 
     Args:
         resolutions: cells of each grid along a side of the cube [-1, 1]^3.
-        channels: channels of each grid.
-        spread: half-width of the uniform initial values.
+        channels: number of channels of each grid.
+        spread: initial values are uniform in [-spread, spread].
         generator: source of the initial values.
     """
 
@@ -75,7 +76,7 @@ class FeatureGrids(nn.Module):
         self.width = channels * len(self.resolutions)
 
     def forward(self, places: Tensor) -> Tensor:
-        """Return features [N, width] at places [N, 3]. Places are clamped to the cube."""
+        """Compute features [N, width] at positions [N, 3], which are clamped to the cube."""
         features = []
         for resolution, table in zip(self.resolutions, self.levels, strict=True):
             nodes, weights = linear_weights(places, resolution)
@@ -84,10 +85,11 @@ class FeatureGrids(nn.Module):
 
 
 def spline_weights(places: Tensor, resolution: int) -> tuple[Tensor, Tensor]:
-    """Return the 27 nodes [N, 27] around each place [N, 3], and their weights [N, 4, 27] for value and gradient.
+    """Return the 27 nodes around each position [N, 3], and their weights [N, 4, 27] for value and gradient.
 
-    Let t in [0, 1] be the position of a place in its cell along an axis. The previous, the own and the next cell have
-    the weights (1 - t)^2 / 2, 1/2 + t - t^2 and t^2 / 2. A grid therefore has a layer of nodes around the cube.
+    Let t in [0, 1] be the coordinate of a position within its cell along an axis. The weight of the previous cell is (1
+    - t)^2 / 2, the weight of the cell itself is 1/2 + t - t^2, and the weight of the next cell is t^2 / 2. So a grid
+    needs an additional layer of nodes around the cube.
     """
     cell, t = _cell(places, resolution)
     nodes = _nodes(cell, resolution + 2, 3)
@@ -100,14 +102,14 @@ def spline_weights(places: Tensor, resolution: int) -> tuple[Tensor, Tensor]:
 
 
 def spline_matrix(axis: Tensor, resolution: int) -> Tensor:
-    """Return weights [M, resolution + 2] of a grid's nodes along one axis, at places [M] on it."""
+    """Return the weights [M, resolution + 2] of a grid's nodes along one axis for positions [M] on this axis."""
     cell, t = _cell(axis, resolution)
     nodes = cell.long()[:, None] + torch.arange(3, device=axis.device)
     return axis.new_zeros(len(axis), resolution + 2).scatter_(1, nodes, _quadratic(t))
 
 
 def linear_weights(places: Tensor, resolution: int) -> tuple[Tensor, Tensor]:
-    """Return the 8 nodes [N, 8] around each place [N, 3], and their weights [N, 8]."""
+    """Return the 8 nodes [N, 8] around each position [N, 3], and their trilinear weights [N, 8]."""
     cell, t = _cell(places, resolution)
     wx, wy, wz = torch.stack((1 - t, t), dim=-1).unbind(1)
     return _nodes(cell, resolution + 1, 2), _outer(wx, _outer(wy, wz))
@@ -119,19 +121,22 @@ def _quadratic(t: Tensor) -> Tensor:
 
 
 def _cell(places: Tensor, resolution: int) -> tuple[Tensor, Tensor]:
-    """Return the cell [...] of each place along an axis, a whole number, and the position in it, in [0, 1]."""
+    """Return the index [...] of the cell of each position along an axis, and the position within the cell, in [0, 1]."""
     scaled = (0.5 * resolution) * (places.clamp(-1, 1) + 1)
     cell = scaled.floor().clamp(max=resolution - 1)
     return cell, scaled - cell
 
 
 def _nodes(cell: Tensor, side: int, reach: int) -> Tensor:
-    """Return indices of nodes, beginning at each cell, ``reach`` along each axis, in a grid with ``side`` of them."""
+    """Return the indices of the block of nodes that begins at each cell.
+
+    The block has ``reach`` nodes along each axis. The grid has ``side`` nodes along each axis.
+    """
     steps = torch.tensor([(x * side + y) * side + z for x, y, z in product(range(reach), repeat=3)])
     x, y, z = cell.long().unbind(1)
     return ((x * side + y) * side + z)[:, None] + steps.to(cell.device)
 
 
 def _outer(a: Tensor, b: Tensor) -> Tensor:
-    """Return products [N, J K] of weights [N, J] and [N, K]."""
+    """Return all products [N, J K] of weights [N, J] and weights [N, K]."""
     return (a[:, :, None] * b[:, None, :]).flatten(1)

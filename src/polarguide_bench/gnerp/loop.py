@@ -1,6 +1,7 @@
-"""Training loop of a field. A step compares several hundred rays of one view with color, DoLP and AoLP.
+"""Training loop of a field. A step compares several hundred rays of one view with measured color, DoLP and AoLP.
 
-The loss terms are those of GNeRP (Li et al. 2024): color, angle of polarization, eikonal, and guidance by covariances.
+The loss has the terms of GNeRP (Li et al. 2024): color, angle of polarization, eikonal term, and guidance by
+covariances.
 """
 
 from __future__ import annotations
@@ -27,15 +28,15 @@ from polarguide_bench.gnerp.state import FieldState
 
 
 def color_loss(predicted: Tensor, measured: Tensor, dolp: Tensor) -> Tensor:
-    """Return the mean of ``(1 - DoLP) |difference|`` of display colors [N, 3], with DoLP [N]."""
+    """Return the mean difference of display colors [N, 3], weighted with 1 - DoLP [N]."""
     return ((1 - dolp)[:, None] * (predicted - measured).abs()).mean()
 
 
 def aolp_loss(normal: Tensor, rays: Tensor, aolp: Tensor, dolp: Tensor, *, circular: bool) -> Tensor:
-    """Return the mean of DoLP times the difference between the predicted and the measured angle of polarization.
+    """Return the mean difference between predicted and measured angle of polarization, weighted with the DoLP.
 
-    The prediction holds for specular light, which is polarized perpendicular to the plane of incidence. It is the
-    azimuth of the blended normal about the ray plus 90 degrees, modulo 180.
+    The prediction is the azimuth of the blended normal about the ray plus 90 degrees, modulo 180. It is valid for
+    specular light, which is polarized perpendicular to the plane of incidence.
 
     Args:
         normal: blended normals [N, 3] in camera axes, of any length.
@@ -43,7 +44,7 @@ def aolp_loss(normal: Tensor, rays: Tensor, aolp: Tensor, dolp: Tensor, *, circu
         aolp: [N] radians in [0, pi), in the lens frame.
         dolp: [N] in [0, 1].
         circular: use ``(1 - cos 2 difference) / 2``. Otherwise use the published difference of numbers in [0, pi),
-            which jumps if one of them passes 180 degrees.
+            which jumps if one of the angles passes 180 degrees.
     """
     right, up = _across(normal, rays)
     if circular:
@@ -60,7 +61,7 @@ def aolp_loss(normal: Tensor, rays: Tensor, aolp: Tensor, dolp: Tensor, *, circu
 
 
 def eikonal_loss(slopes: Tensor) -> Tensor:
-    """Return the mean of ``(|gradient| - 1)^2`` over gradients [..., 3]."""
+    """Return the mean of ``(|gradient| - 1)^2`` over gradients [..., 3] of the distance."""
     return ((dot(slopes, slopes) + 1e-12).sqrt() - 1).square().mean()
 
 
@@ -68,25 +69,25 @@ def guidance_loss(
     normals: Tensor, around: Tensor, weights: Tensor, rays: Tensor, aolp: Tensor, neighbors: Tensor,
     dolp: Tensor, *, circular: bool,
 ) -> Tensor:  # fmt: skip
-    """Return the L1 distance between the covariances of normals around a ray's samples and of the AoLP.
+    """Return the L1 distance between two covariances: of normals around the samples of a ray, and of the measured AoLP.
 
-    A sample has six neighbors. The covariance of their normals about its own normal is projected to the plane
-    perpendicular to the ray, [2, 2], and blended along the ray.
+    A sample has six neighbors. The first covariance is computed from their normals about the normal of the sample. It
+    is projected to the plane perpendicular to the ray, [2, 2], and blended along the ray.
 
-    The covariance of the picture is that of ``(sin, -cos)`` of the AoLP at four pixels about the vector of the ray's
-    own pixel. It is multiplied by the squared length of the blended normal perpendicular to the ray. In the published
-    term, ``(sin, -cos)`` flips its sign if the AoLP passes 180 degrees, but the normal does not. ``circular`` doubles
-    the angles of both.
+    The second covariance is computed from vectors ``(sin, -cos)`` of the AoLP at four neighboring pixels about the
+    vector of the ray's own pixel. It is multiplied by the squared length of the part of the blended normal that is
+    perpendicular to the ray. In the published term, ``(sin, -cos)`` changes its sign if the AoLP passes 180 degrees,
+    but the normal does not. ``circular`` avoids this by doubling the angles in both covariances.
 
     Args:
         normals: normals [N, K, 3] of the samples in camera axes, unit length.
-        around: normals [N, K, 6, 3] of their neighbors.
+        around: normals [N, K, 6, 3] of the neighbors of each sample.
         weights: weights [N, K] of the samples in the picture.
         rays: [N, 3] in camera axes, unit length.
         aolp: [N] radians.
         neighbors: AoLP [N, 4] of the neighboring pixels.
         dolp: weight [N] of each ray.
-        circular: double the angles.
+        circular: double the angles in both covariances.
     """
     own = torch.stack(_across(normals, rays[:, None]), dim=-1)
     others = torch.stack(_across(around, rays[:, None, None]), dim=-1)
@@ -102,7 +103,7 @@ def guidance_loss(
 
 
 def _across(vectors: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
-    """Return components of vectors in the lens frame of rays, image right and image up."""
+    """Return the components of vectors to the right and up in the lens frame of each ray."""
     right, up = lens_frame(rays)
     return dot(vectors, right), dot(vectors, up)
 
@@ -115,14 +116,14 @@ def _doubled(vectors: Tensor) -> Tensor:
 
 
 def _covariance(own: Tensor, others: Tensor) -> Tensor:
-    """Return the covariance [..., 2, 2] of vectors [..., M, 2] about [..., 2], divided by M - 1."""
+    """Return the covariance [..., 2, 2] of vectors [..., M, 2] about the vector [..., 2], with divisor M - 1."""
     apart = others - own[..., None, :]
     return apart.transpose(-1, -2) @ apart / (others.shape[-2] - 1)
 
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """Target of a view in row-major order, with P = H W pixels.
+    """Measured values of a view that a field is trained with, for P = H W pixels in row-major order.
 
     Attributes:
         picture: display colors [P, 3].
@@ -138,7 +139,7 @@ class Target:
 
 
 def target_of(view: View, store: ViewStore, device: torch.device) -> Target:
-    """Return the target of a view. It is computed once and stored with two bytes per value."""
+    """Return the target of a view from a cache. The cache stores two bytes per value."""
 
     def make() -> Entry:
         entry = {"picture": packed(srgb_encode(view.photograph().clamp(0, 1)).to(device))}
@@ -161,13 +162,13 @@ def target_of(view: View, store: ViewStore, device: torch.device) -> Target:
 
 
 MAP_EVERY = 16
-"""Steps between updates of the map of distances."""
+"""Number of steps between updates of the coarse map of distances."""
 GLANCE = (0.3, 0.7)
-"""Shares of the steps between which the weight of the direction in the color rises from 0 to 1.
+"""Start and end of the rise of the color's dependence on direction, as shares of all steps.
 
-Before, the color depends on the place alone, so that a wrong surface cannot imitate each view."""
+At first, the color depends only on the position, so that a wrong surface cannot fit each view separately."""
 DIAGONAL = ((-1, -1), (-1, 1), (1, -1), (1, 1))
-"""Neighbors of a pixel as offsets of rows and columns."""
+"""Offsets of the diagonal neighbors of a pixel, in rows and columns."""
 
 
 class FieldLoop(Loop):
@@ -178,8 +179,8 @@ class FieldLoop(Loop):
         recipe: the recipe.
         settings: settings of the training, with one view per step.
         device: device of the training.
-        state: state on the device to resume from; None: a new training.
-        store: cache of the targets; None: in memory.
+        state: state on the device from which training resumes. None starts a new training.
+        store: cache of the targets. None keeps the targets in memory.
     """
 
     state: FieldState
@@ -202,7 +203,7 @@ class FieldLoop(Loop):
         self._store = store or ViewStore()
 
     def optimize(self) -> tuple[Tensor, str, None]:
-        """Do one optimizer step with rays of one view."""
+        """Perform one optimizer step with rays of one view."""
         state = self.state
         settings = self.settings
         sampling = self.recipe.sampling
@@ -262,7 +263,7 @@ class FieldLoop(Loop):
     def _guidance(
         self, marched: RaySamples, camera: Camera, rays: Tensor, pixels: Tensor, target: Target
     ) -> Tensor:
-        """Return the guidance at the samples with the largest weights of each ray."""
+        """Compute the guidance loss at those samples of each ray that have the largest weights."""
         largest = marched.weights.detach().topk(self.recipe.sampling.neighbors, dim=1).indices
         index = largest[..., None].expand(-1, -1, 3)
         around = self._neighbors(marched, camera, rays, largest)
@@ -285,7 +286,7 @@ class FieldLoop(Loop):
         )
 
     def _neighbors(self, marched: RaySamples, camera: Camera, rays: Tensor, chosen: Tensor) -> Tensor:
-        """Return places [N, K, 6, 3] around samples [N, K]: four at diagonal pixels, two along the ray."""
+        """Return six positions around each sample, [N, K, 6, 3]: four on rays of diagonal pixels, and two along the ray."""
         places = marched.places.gather(1, chosen[..., None].expand(-1, -1, 3))
         width = (marched.along.gather(1, chosen) / camera.fx)[..., None]
         pose = camera.pose(places.dtype, places.device)
@@ -296,14 +297,14 @@ class FieldLoop(Loop):
         return torch.stack([places + step for step in (*steps, ahead, -ahead)], dim=2)
 
     def _view_of(self, place: int) -> View:
-        """Return the view at a place in the sequence of all views. Each epoch visits each view once, in a new order."""
+        """Return the view at an index of the training sequence, in which each epoch contains each view once, in a new order."""
         views = self.scene.train_views
         epoch, place = divmod(place, len(views))
         order = torch.randperm(len(views), generator=seeded(self.settings.seed, 4, epoch))
         return views[int(order[place])]
 
     def _set_rates(self, share: float) -> None:
-        """Set the rates of this step: a linear warm-up, then a cosine."""
+        """Set the learning rates of this step: a linear warm-up, followed by a cosine decay."""
         rates = self.recipe.rates
         shape = self.recipe.shape
         late = max(0.0, (share - rates.warmup) / (1 - rates.warmup))

@@ -1,4 +1,4 @@
-"""Rays through a field: sample positions, and their colors and weights (NeuS, Wang et al. 2021)."""
+"""Rendering of rays through a field by samples with colors and weights (NeuS, Wang et al. 2021)."""
 
 from __future__ import annotations
 
@@ -13,31 +13,31 @@ from polarguide_bench.gnerp.field import Field
 from polarguide_bench.gnerp.recipe import Sampling
 
 DIFFUSE_SHARE = 0.1
-"""Share of the sampling probability that is uniform along a ray."""
+"""Share of the samples' probability density that is uniform along a ray."""
 FIRST_SHARPNESS = 16.0
-"""Largest sharpness of the first search. Samples must lie on both sides of the surface."""
+"""Upper bound of the sharpness in the first search, so that samples lie on both sides of the surface."""
 SECOND_SHARPNESS = 64.0
-"""Largest sharpness of the second search."""
+"""Upper bound of the sharpness in the second search."""
 TRACED = 64
-"""Steps of sphere tracing."""
+"""Number of steps of sphere tracing."""
 STRIDE = 0.9
-"""Step length over the distance, which is not exact."""
+"""Ratio of the step length to the distance. It is below 1, because the learned distance is not exact."""
 HIT = 0.01
-"""Largest distance of a hit, in the unit of the region."""
+"""Largest distance from the surface at which a ray counts as a hit, in the unit of the region."""
 BEHIND_SCALE = 8.0
 """Optical length of the background, from the sphere to infinity."""
 
 
 @dataclass(frozen=True, eq=False)
 class RaySamples:
-    """Samples of N rays, S each.
+    """Samples of N rays, with S samples per ray.
 
     Attributes:
-        color: display colors [N, 3] with the background.
+        color: display colors [N, 3] of the rays, with the background.
         along: distances [N, S] along the rays.
-        weights: weights [N, S] in the picture.
+        weights: weights [N, S] of the samples in the color of the ray.
         places: coordinates [N, S, 3] of the field.
-        slopes: gradients [N, S, 3] of the field.
+        slopes: gradients [N, S, 3] of the distance.
         normals: directions [N, S, 3] of the gradients.
     """
 
@@ -50,17 +50,17 @@ class RaySamples:
 
     @property
     def opacity(self) -> Tensor:
-        """Opacity [N] of the surface."""
+        """Opacity [N] of the surface on each ray."""
         return self.weights.sum(dim=1)
 
     @property
     def distance(self) -> Tensor:
-        """Expected distance [N] along the ray, over the opacity."""
+        """Mean distance [N] of the samples along each ray, weighted with their weights."""
         return (self.weights * self.along).sum(dim=1) / self.opacity.clamp(min=1e-6)
 
     @property
     def normal(self) -> Tensor:
-        """Blended normal [N, 3], not longer than 1."""
+        """Blended normal [N, 3] of each ray, not longer than 1."""
         return (self.weights[..., None] * self.normals).sum(dim=1)
 
 
@@ -79,7 +79,7 @@ def march(
         origin: [N, 3] in coordinates of the field.
         direction: [N, 3], unit length.
         sampling: number of samples.
-        generator: source of random positions in strata. None: samples at the centers.
+        generator: source of random positions within the strata. None places samples at the centers of the strata.
     """
     count = len(origin)
     fine = sampling.fine
@@ -109,10 +109,10 @@ def march(
 def trace(field: Field, origin: Tensor, direction: Tensor) -> tuple[Tensor, Tensor]:
     """Find the first intersections of rays with the surface by sphere tracing (Hart 1996).
 
-    The first steps use the field's map, the last ones the field itself.
+    The first steps use the coarse map of distances. The last steps use the field itself.
 
     Returns:
-        Distances [N] along the rays, and a mask [N] of the hits.
+        Distances [N] along the rays, and a mask [N] of the rays that hit the surface.
     """
     begin, end = field.region.span(origin, direction)
     along = begin
@@ -126,7 +126,7 @@ def trace(field: Field, origin: Tensor, direction: Tensor) -> tuple[Tensor, Tens
 
 
 def section_opacity(first: Tensor, last: Tensor) -> Tensor:
-    """Return the opacity of sections of a ray from the scaled distances ``s f`` at their ends (NeuS, Eq. 13)."""
+    """Return the opacity of sections of a ray from ``s f`` (sharpness times distance) at both ends (NeuS, Eq. 13)."""
     entering = torch.sigmoid(first)
     leaving = torch.sigmoid(last)
     return ((entering - leaving) / (entering + 1e-5)).clamp(0, 1)
@@ -141,7 +141,7 @@ def _samples(
     sampling: Sampling,
     generator: torch.Generator | None,
 ) -> Tensor:
-    """Return sorted positions [N, S] of the fine samples, concentrated where the field's map is opaque."""
+    """Return sorted positions [N, S] of the fine samples, which are denser where the coarse map is opaque."""
 
     def near(along: Tensor) -> Tensor:
         return field.near_distance(origin[:, None] + along[..., None] * direction[:, None])
@@ -160,7 +160,10 @@ def _samples(
 
 
 def _map_weights(along: Tensor, distance: Tensor, sharpness: float) -> Tensor:
-    """Return weights of the sections between samples [N, C], with a share for surfaces that the map misses."""
+    """Return weights of the sections between samples [N, C].
+
+    A share of the weight is uniform, for surfaces that the coarse map does not contain.
+    """
     step = (along[:, 1:] - along[:, :-1]).clamp(min=1e-6)
     middle = 0.5 * (distance[:, 1:] + distance[:, :-1])
     half = 0.5 * (distance[:, 1:] - distance[:, :-1]).minimum(torch.zeros_like(step)).maximum(-10 * step)
@@ -172,7 +175,7 @@ def _map_weights(along: Tensor, distance: Tensor, sharpness: float) -> Tensor:
 
 
 def _strata(rays: int, count: int, like: Tensor, generator: torch.Generator | None) -> Tensor:
-    """Return a number in each of ``count`` equal parts of [0, 1], for each ray: [N, count]."""
+    """Return numbers [N, count], one in each of ``count`` equal parts of [0, 1], for each ray."""
     part = torch.arange(count, dtype=like.dtype, device=like.device)
     if generator is None:
         return ((part + 0.5) / count).expand(rays, -1)
@@ -193,7 +196,10 @@ def _inverse(edges: Tensor, weight: Tensor, share: Tensor) -> Tensor:
 
 
 def _sections(along: Tensor, begin: Tensor, end: Tensor, longest: Tensor) -> tuple[Tensor, Tensor]:
-    """Return offsets from each sample [N, S] to the ends of its section, halfway to its neighbors, with a limit."""
+    """Return the offsets from each sample [N, S] to both ends of its section.
+
+    The ends are halfway to the neighboring samples, but not farther than ``longest`` allows.
+    """
     middle = 0.5 * (along[:, 1:] + along[:, :-1])
     before = torch.cat((begin[:, None], middle), dim=1) - along
     after = torch.cat((middle, end[:, None]), dim=1) - along
@@ -203,7 +209,7 @@ def _sections(along: Tensor, begin: Tensor, end: Tensor, longest: Tensor) -> tup
 def _behind(
     field: Field, origin: Tensor, direction: Tensor, count: int, generator: torch.Generator | None
 ) -> Tensor:
-    """Return display colors [N, 3] of the background behind the cameras' sphere. The last sample is opaque."""
+    """Render display colors [N, 3] of the background outside the sphere of the cameras. The last sample is opaque."""
     share = _strata(len(origin), count, origin, generator)
     reach = field.region.radius / (1 - share).clamp(min=1e-4)
     middle = -dot(origin, direction)[:, None]

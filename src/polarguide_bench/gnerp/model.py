@@ -1,4 +1,4 @@
-"""Model of a trained field: it renders the layers for scores and reports, and extracts the surface."""
+"""Model of a trained field, which renders layers for scores and reports and extracts the surface."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from polarguide_bench.gnerp.recipe import NeuralRecipe
 from polarguide_bench.gnerp.state import FieldState
 
 CHUNK = 4096
-"""Batch size, in rays."""
+"""Number of rays in a batch."""
 
 
 class FieldModel:
-    """A trained field of signed distance and color.
+    """Trained field of signed distance and color.
 
     Args:
         state: state of the training.
@@ -44,7 +44,7 @@ class FieldModel:
 
     @property
     def gaussians(self) -> None:
-        """None: a field has no Gaussians."""
+        """None, because a field has no Gaussians."""
 
     @torch.no_grad()
     def render(
@@ -59,9 +59,9 @@ class FieldModel:
 
         Args:
             camera: the camera.
-            normals: add normals.
-            depth: add the depth.
-            surface: unused. The depth is always that of the surface.
+            normals: also render normals.
+            depth: also render depth.
+            surface: not used, because the depth is always the depth of the surface.
         """
         batches = [self._render_rays(*rays, depth) for rays in self._rays(camera)]
         color, normal, opacity, distance = (torch.cat(parts) for parts in zip(*batches, strict=True))
@@ -76,11 +76,11 @@ class FieldModel:
         return RenderResult(layers)
 
     def stokes(self, result: RenderResult, camera: Camera) -> None:
-        """Return None: a field predicts an angle of polarization, but no Stokes vector."""
+        """Return None, because a field predicts an angle of polarization, but no Stokes vector."""
 
     @torch.no_grad()
     def alpha_in_front(self, camera: Camera, depth: Tensor) -> Tensor:
-        """Return the share of each pixel's opacity [H, W] in front of a depth [H, W]; 0 for depths up to 0."""
+        """Return the share [H, W] of each pixel's opacity in front of a depth [H, W]. It is 0 if the depth is not positive."""
         rays = camera.rays(device=self.device).view(-1, 3)
         far = depth.to(rays).flatten() / rays[:, 2] / self.field.region.unit
         shares = []
@@ -92,7 +92,7 @@ class FieldModel:
 
     @torch.no_grad()
     def lattice(self, axes: tuple[Tensor, Tensor, Tensor]) -> Tensor:
-        """Return signed distances [X, Y, Z] in world units at all combinations of world coordinates, on the CPU."""
+        """Compute signed distances [X, Y, Z] in world units at all combinations of world coordinates, on the CPU."""
         region = self.field.region
         own = [
             ((axis.to(self.device, torch.float32)) - origin) / region.unit
@@ -101,13 +101,13 @@ class FieldModel:
         return (self.field.lattice(own) * region.unit).cpu()
 
     def _rays(self, camera: Camera) -> list[tuple[Tensor, Tensor]]:
-        """Return batches of origins and directions of all pixels."""
+        """Return the origins and directions of the rays of all pixels, in batches."""
         directions = camera.world_rays(device=self.device).view(-1, 3)
         center = self.field.region.inner(camera.pose(directions.dtype, self.device).center)
         return [(center.expand(len(part), 3), part) for part in directions.split(CHUNK)]
 
     def _render_rays(self, origin: Tensor, direction: Tensor, depth: bool) -> tuple[Tensor, ...]:
-        """Return display color [N, 3], normal [N, 3], opacity [N] and distance [N] of rays."""
+        """Render display color [N, 3], normal [N, 3], opacity [N] and distance [N] of rays."""
         marched = march(self.field, origin, direction, self.recipe.sampling)
         distance = marched.distance
         if depth:
@@ -117,17 +117,17 @@ class FieldModel:
 
 
 def implicit_surface(cameras: Mapping[str, Camera], model: FieldModel, *, resolution: int) -> Surface:
-    """Extract the zero set of a model's distance, if at least two cameras can see it.
+    """Extract the surface of a model: the zero set of its distance in the pictures of at least two cameras.
 
-    The surface lies within the distance of the cameras from their center of interest.
+    The search is limited to the sphere around the center of interest on which the cameras lie.
 
     Args:
         cameras: at least two cameras.
         model: model of the run.
-        resolution: voxels along the longest side.
+        resolution: number of voxels along the longest side.
 
     Raises:
-        PolarguideError: there is no surface, or a library is missing.
+        PolarguideError: there is no surface, or a required package is missing.
     """
     optional_import("skimage.measure", "a mesh")
     frame = scene_frame(list(cameras.values()))
@@ -141,13 +141,13 @@ def implicit_surface(cameras: Mapping[str, Camera], model: FieldModel, *, resolu
 
 
 def _sampled(box: Box, model: FieldModel) -> tuple[Tensor, Tensor]:
-    """Return the centers [X, Y, Z, 3] of a box's voxels, and the distances [X, Y, Z] there."""
+    """Return the centers [X, Y, Z, 3] of a box's voxels, and the signed distances [X, Y, Z] at these points."""
     x, y, z = (box.low[k] + box.size * (torch.arange(n) + 0.5) for k, n in enumerate(box.counts))
     return torch.stack(torch.meshgrid(x, y, z, indexing="ij"), dim=-1), model.lattice((x, y, z))
 
 
 def _in_pictures(cameras: Mapping[str, Camera], places: Tensor) -> Tensor:
-    """Return the number of cameras [...] whose pictures contain places [..., 3], including hidden ones."""
+    """Return the number of cameras [...] whose pictures contain each position [..., 3], even if it is hidden."""
     counts = torch.zeros(places.shape[:-1])
     for camera in cameras.values():
         for part, count in zip(places, counts, strict=True):

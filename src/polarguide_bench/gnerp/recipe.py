@@ -1,4 +1,4 @@
-"""Neural recipes as data."""
+"""Recipes for neural fields, defined as data."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ class FieldShape:
     """Sizes of a field.
 
     Attributes:
-        kind: dense grids with a small head, or the networks of the publication.
-        resolutions: resolutions of the grids in cells along a side.
-        channels: features of each grid.
-        width: width of the two hidden layers of the heads.
-        background: resolutions of the grids behind the cameras' sphere.
-        first_radius: radius of the initial spherical surface in the unit of the region, which is half the width of a
-            picture at the center. It is clamped to half of the radius of the cameras' sphere.
+        kind: kind of field: dense grids with a small network, or the networks of the publication.
+        resolutions: number of cells along a side of each grid.
+        channels: number of features of each grid.
+        width: number of units in both hidden layers of the small networks.
+        background: number of cells along a side of each grid of the background.
+        first_radius: radius of the initial surface, a sphere, in the unit of the region. The unit is half the width of
+            a picture at the center. The radius is clamped to half of the radius of the sphere of cameras.
         first_spread: reciprocal of the initial sharpness, in the unit of the region.
     """
 
@@ -38,14 +38,15 @@ class FieldShape:
 
 @dataclass(frozen=True)
 class Sampling:
-    """Rays and samples of a step.
+    """Numbers of rays and samples in a training step.
 
     Attributes:
-        rays: rays of one view.
-        coarse: samples of a ray in the search for the surface, without a gradient. A second search takes as many.
-        fine: samples of a ray with a gradient.
-        background: samples of a ray behind the cameras' sphere.
-        neighbors: samples of a ray with the largest weights, whose neighbors the guidance evaluates.
+        rays: number of rays, all from one view.
+        coarse: samples per ray in each of the two searches for the surface. They have no gradient.
+        fine: samples per ray from which the loss is computed.
+        background: samples per ray outside the sphere of the cameras.
+        neighbors: samples per ray at which the guidance loss is computed. They are the samples with the largest
+            weights.
     """
 
     rays: int = 512
@@ -56,7 +57,7 @@ class Sampling:
 
     @property
     def samples(self) -> int:
-        """Number of samples of a step with a gradient."""
+        """Number of samples with a gradient in a step."""
         return self.rays * (self.fine + self.background + 6 * self.neighbors)
 
 
@@ -65,11 +66,11 @@ class FieldWeights:
     """Weights of the loss terms.
 
     Attributes:
-        color: L1 of display colors, times 1 - DoLP.
-        aolp: difference of the angles in radians, times DoLP.
-        eikonal: squared difference of the gradient's length from 1.
-        guidance: L1 of the covariances of normals, after ``guided``.
-        guided: share of all steps before the guidance.
+        color: weight of the L1 difference of display colors, which is multiplied by 1 - DoLP.
+        aolp: weight of the difference of angles in radians, which is multiplied by the DoLP.
+        eikonal: weight of the squared difference between the length of the gradient and 1.
+        guidance: weight of the L1 difference of covariances, which is used after ``guided``.
+        guided: share of all steps after which the guidance begins.
         circular: compare angles as (1 - cos of twice their difference) / 2, and double the angles in the guidance. Both
             terms are then equal at 0 and 180 degrees, unlike the published terms.
     """
@@ -84,17 +85,17 @@ class FieldWeights:
 
 @dataclass(frozen=True)
 class FieldRates:
-    """Learning rates of Adam. They rise over the first steps and fall along a cosine.
+    """Learning rates of Adam, which rise over the first steps and then decay along a cosine.
 
     Attributes:
-        distances: rate of the coarsest grid of distances.
-        finer: exponent of the rates of finer grids over the size of their cells. With 1, all grids bend normals at the
-            same rate.
-        features: rate of the grids of features.
-        networks: rate of heads and networks.
-        sharpness: rate of the logarithm of the sharpness, over 10.
-        warmup: share of all steps of the rise.
-        last: ratio of the last rate to the highest.
+        distances: learning rate of the coarsest grid of distances.
+        finer: exponent with which the rate of a finer grid depends on its cell size. With 1, all grids change normals
+            equally fast.
+        features: learning rate of the grids of features.
+        networks: learning rate of all networks.
+        sharpness: learning rate of ln(sharpness) / 10.
+        warmup: share of all steps in which the rates rise.
+        last: ratio of the last rate to the highest rate.
     """
 
     distances: float = 3e-2
@@ -108,14 +109,14 @@ class FieldRates:
 
 @dataclass(frozen=True)
 class NeuralRecipe:
-    """A method that trains a field.
+    """Recipe that trains a field.
 
     Attributes:
         name: value of ``--recipe``.
         about: description in one line.
         steps: default number of steps.
         shape: sizes of the field.
-        sampling: rays and samples of a step.
+        sampling: numbers of rays and samples in a step.
         weights: weights of the loss terms.
         rates: learning rates.
     """
@@ -130,7 +131,7 @@ class NeuralRecipe:
 
     @property
     def numbers(self) -> int:
-        """Approximate number of parameters."""
+        """Approximate number of learned parameters."""
         shape = self.shape
         if shape.kind == "networks":
             return 1_000_000

@@ -1,6 +1,7 @@
-"""Runs of a field: training, resuming and opening. They have no viewer, no export and no page.
+"""Runs of a field: training, resuming and opening.
 
-The memory of a training is planned from the headers of the scene's files.
+Such runs cannot be viewed, exported or shared. The memory of a training is planned from the headers of the scene's
+files.
 """
 
 from __future__ import annotations
@@ -42,24 +43,24 @@ from polarguide_bench.gnerp.recipe import NeuralRecipe
 from polarguide_bench.gnerp.state import FieldState
 
 FIELD_COPIES = 5
-"""Copies of the parameters of a field: values, gradients, two moments, and the checkpoint."""
+"""Number of copies of a field's parameters in memory: values, gradients, two moments, and the checkpoint."""
 SAMPLE = 14_000
-"""Memory of a sample of a step, in bytes."""
+"""Memory of one sample in a training step, in bytes."""
 READ_VIEW = 60
-"""Memory of a pixel of the view of a step, in bytes."""
+"""Memory of one pixel of the view that a step reads, in bytes."""
 TARGET_BYTES = 10
-"""Memory of a pixel in the cache of targets, in bytes."""
+"""Memory of one pixel in the cache of targets, in bytes."""
 
 
 def plan_field_memory(
     pixels: Sequence[int], recipe: NeuralRecipe, *, limit: float | None, in_memory: bool = False
 ) -> MemoryPlan:
-    """Divide memory between the step of a field's training and its views.
+    """Divide memory between the training steps of a field and the cache of its views.
 
     Args:
         pixels: number of training pixels of each view.
         recipe: the recipe.
-        limit: memory limit of the process in GiB; None: four fifths of the free memory.
+        limit: memory limit of the process in GiB. None uses four fifths of the free memory.
         in_memory: True if the pictures are already in memory.
 
     Raises:
@@ -72,11 +73,11 @@ def plan_field_memory(
 
 @dataclass(frozen=True, eq=False)
 class FieldRun:
-    """A trained run of a field, with the interface that scores and reports need.
+    """Trained run of a field, with the interface that scores and reports need.
 
     Attributes:
         folder: run folder.
-        configuration: its record.
+        configuration: recorded configuration of the run.
         recipe: recipe of the training.
         model: the trained field.
     """
@@ -109,7 +110,7 @@ class FieldRun:
         return {view.name: view.camera for view in self.scene.views}
 
     def surface(self) -> Surface:
-        """Extract the zero set of the signed distance, for mesh scores.
+        """Extract the surface, which is the zero set of the signed distance, for scores of the mesh.
 
         Raises:
             PolarguideError: there is no surface.
@@ -138,12 +139,12 @@ def train_field(
         settings: steps, seed and other settings of the training.
         session: device, threads and interval of checkpoints.
         reading: options for reading the scene.
-        resume: resume the run in ``out``. The result does not depend on the interruption.
+        resume: resume the run in ``out``. The result is the same as without the interruption.
         reporter: receives progress.
-        should_stop: called between steps.
+        should_stop: function that is called between steps and returns True to stop.
 
     Raises:
-        PolarguideError: invalid input, an unsuitable folder, or a loss that is not finite.
+        PolarguideError: the input is invalid, the folder is not suitable, or a loss is not finite.
         TrainingStopped: ``should_stop`` returned True. The state is saved.
     """
     out = Path(out)
@@ -205,16 +206,16 @@ def resolve_field(
     recipe: NeuralRecipe,
     resumed: ResolvedSettings | None = None,
 ) -> ResolvedSettings:
-    """Resolve the open settings of a field's training.
+    """Choose all settings of a field's training that are not specified.
 
     Args:
         settings: specified settings.
         scene: the scene.
         recipe: the recipe.
-        resumed: settings of the resumed run, if any. They override those of the scene.
+        resumed: settings of the run that is resumed, if any. They have priority over the settings of the scene.
 
     Raises:
-        PolarguideError: a setting that a field does not support.
+        PolarguideError: a field does not support a setting.
     """
     recorded: dict[str, Any] = {} if resumed is None else vars(resumed)
     values: dict[str, Any] = {

@@ -24,12 +24,12 @@ EPSILON = 1e-15
 
 @dataclass
 class FieldState:
-    """Complete state between two steps.
+    """Complete state of a training between two steps.
 
     Attributes:
-        step: next step, 0-based.
+        step: index of the next step, 0-based.
         field: the field.
-        optimizer: Adam. Each step sets its rates.
+        optimizer: the optimizer Adam, whose learning rates each step sets.
     """
 
     step: int
@@ -40,7 +40,7 @@ class FieldState:
     def first(
         cls, recipe: NeuralRecipe, cameras: Sequence[Camera], seed: int, device: torch.device | str = "cpu"
     ) -> FieldState:
-        """Create the initial state. The CPU draws the values, so all devices start with the same ones."""
+        """Create the initial state. Random values are drawn on the CPU, so they do not depend on the device."""
         return cls.around(0, recipe, Region.around(cameras), seed, device)
 
     @classmethod
@@ -70,10 +70,11 @@ class FieldState:
     def from_tensors(
         cls, tensors: Mapping[str, Tensor], recipe: NeuralRecipe, device: torch.device | str
     ) -> FieldState:
-        """Invert ``tensors`` and validate all values, since they come from a file.
+        """Create a state from the result of ``tensors``, and validate all values, because they come from a file.
 
         Raises:
-            ValueError: a missing or unknown tensor, or an invalid shape, type or value. The message names it.
+            ValueError: a tensor is missing or unknown, or has an invalid shape, type or value. The message names the
+                tensor.
         """
         rules = {
             "scalars": TensorRule((1,), 0, MOST_STEPS, torch.int64),

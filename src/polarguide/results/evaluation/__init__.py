@@ -1,1 +1,1 @@
-"""How good a trained scene is: metrics, their one table, and the record of a run."""
+"""Quality of a trained scene: definitions of metrics, the table that lists them, and the record of a run."""

@@ -1,4 +1,4 @@
-"""Coverage of held-out views: the pixels whose content at least one training view shows."""
+"""Coverage of held-out views: pixels whose content is visible in at least one training view."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from torch.nn import functional
 from polarguide.geometry.camera import Camera, seen_at
 
 BACKGROUND_RADII = 3.0
-"""Distance from the middle of the scene, in camera radii, beyond which content counts as background."""
+"""Distance from the middle of the scene beyond which content counts as background, in camera radii."""
 OPAQUE = 0.5
-"""Least alpha of a rendered surface. Pixels below it show background."""
+"""Minimum alpha of a surface pixel. Pixels with less alpha count as background."""
 DEPTH_TOLERANCE = 1.02
-"""Factor by which a point may lie behind the surface of a training view and still belong to it."""
+"""Tolerance of the visibility test: largest ratio of a point's depth to the surface depth in a training view."""
 
 
 @dataclass(frozen=True, eq=False)
 class DepthMap:
-    """Depths of a view.
+    """Depths of a view, for visibility tests.
 
     Attributes:
         camera: camera of the view.
@@ -32,7 +32,7 @@ class DepthMap:
     depth: Tensor
 
     def points(self) -> Tensor:
-        """Return the world points [H, W, 3] of the pixels; directions instead of points for background."""
+        """Return the world point of each pixel, [H, W, 3]. A background pixel has a direction instead of a point."""
         forward = self.camera.rays(dtype=torch.float64)[..., 2]
         rays = self.camera.world_rays(dtype=torch.float64)
         surface = self.depth.isfinite()
@@ -41,7 +41,7 @@ class DepthMap:
 
 
 def depth_map_of_truth(camera: Camera, depth: Tensor) -> DepthMap:
-    """Return the depth map of a ground truth [H, W], in which 0 marks background."""
+    """Create the depth map of true depths [H, W], in which 0 marks background."""
     values = depth.double()
     return DepthMap(camera, torch.where(values > 0, values, torch.inf))
 
@@ -49,7 +49,7 @@ def depth_map_of_truth(camera: Camera, depth: Tensor) -> DepthMap:
 def depth_map_of_rendering(
     camera: Camera, depth: Tensor, alpha: Tensor, middle: Tensor, radius: float
 ) -> DepthMap:
-    """Return the depth map of a rendering.
+    """Create the depth map of a rendering.
 
     Args:
         camera: camera of the view.
@@ -65,10 +65,10 @@ def depth_map_of_rendering(
 
 
 class Coverage:
-    """Record of the held-out pixels that training views show.
+    """Search for the pixels of held-out views whose content is visible in a training view.
 
-    A training view shows a surface point if the point lies in its picture and no nearer surface hides it. It shows
-    the background in a direction if the pixel of that direction is background there, too.
+    A training view shows a surface point if the point lies in its picture and no nearer surface hides it. It shows the
+    background in a direction if its own pixel in that direction is background.
 
     Args:
         held_out: depth maps of the held-out views by name.
@@ -78,10 +78,10 @@ class Coverage:
         self._surfaces = {name: item.depth.isfinite() for name, item in held_out.items()}
         self._points = {name: item.points() for name, item in held_out.items()}
         self.seen = {name: torch.zeros_like(surface) for name, surface in self._surfaces.items()}
-        """Masks [H, W] by view: True if a training view that was added shows the pixel's content."""
+        """Masks [H, W] by held-out view: True for pixels that at least one of the added training views shows."""
 
     def add(self, training: DepthMap) -> None:
-        """Mark the pixels that a training view shows."""
+        """Add a training view, and mark the held-out pixels whose content it shows."""
         camera = training.camera
         # The farthest depth of the neighborhood: at an edge a pixel may show either surface.
         edges = training.depth.nan_to_num(posinf=torch.finfo(torch.float64).max)[None, None]

@@ -47,16 +47,16 @@ ERRORS_FILE = "errors.png"
 MOST_VIEWS = 8
 """Maximum number of views in the error sheet."""
 PICTURE_HIGH = 0.25
-"""Error of a displayed picture at the bright end of its heat map."""
+"""Difference of displayed values that is drawn at full brightness in the heat map of a picture."""
 NORMAL_HIGH = 45.0
-"""Angle at the bright end of the heat map of normals, in degrees."""
+"""Angle in degrees that is drawn at full brightness in the heat map of normals."""
 BRIGHTEST = (0.05, 0.5)
-"""Bounds of the DoLP that a picture of polarization shows at full brightness."""
+"""Lower and upper bound of the DoLP that is drawn at full brightness in a picture of polarization."""
 MAP = "inferno"
 NOT_COUNTED = 90
-"""Gray level of pixels outside the mask of a score."""
+"""Gray level of pixels that a score does not count."""
 STRIPES = 48
-"""Number of stripes across a picture. They mark pixels whose content no training view shows."""
+"""Number of stripes across a picture. Stripes mark pixels whose content is visible in no training view."""
 COLUMNS = {
     "photograph": "photograph",
     "final": "picture error",
@@ -74,10 +74,12 @@ class _SheetRow(NamedTuple):
     """Row of the error sheet.
 
     Attributes:
-        name: name of the view. pictures: pictures by column.
-        measured: [3, H, W, 3] measured Stokes vectors; None if the pictures do not determine them.
-        predicted: [3, H, W, 3] predicted Stokes vectors; None without a prediction.
-        mask: [H, W] pixels whose polarization counts. unseen: [H, W] pixels that no training view shows.
+        name: name of the view.
+        pictures: pictures by column.
+        measured: [3, H, W, 3] measured Stokes vectors, or None if the pictures do not determine them.
+        predicted: [3, H, W, 3] predicted Stokes vectors, or None without a prediction.
+        mask: [H, W] pixels whose polarization is scored.
+        unseen: [H, W] pixels that no training view shows.
     """
 
     name: str
@@ -89,7 +91,7 @@ class _SheetRow(NamedTuple):
 
 
 class ErrorSheet:
-    """Sheet of error maps: one row per view, one color key per column.
+    """Sheet of error maps with one row per view and a color scale below each column.
 
     Heat maps are black at zero error and bright at the end of their scale. Pixels without a score are gray.
     Gray stripes in the error of picture and polarization mark pixels whose content no training view shows.
@@ -101,7 +103,7 @@ class ErrorSheet:
     The scales of polarization end near the 90th percentile of the measured values.
 
     Args:
-        views: number of views. At most ``MOST_VIEWS`` of them, at equal distances, are drawn.
+        views: number of views. At most ``MOST_VIEWS`` evenly spaced views are drawn.
     """
 
     def __init__(self, views: int) -> None:
@@ -113,7 +115,9 @@ class ErrorSheet:
         """Add the next view if the sheet draws it.
 
         Args:
-            view: the test view. target: its ground truth. result: its rendering.
+            view: the test view.
+            target: its ground truth.
+            result: its rendering.
             stokes: [3, H, W, 3] predicted Stokes vectors; None without a prediction.
         """
         self._added += 1
@@ -201,7 +205,7 @@ def _hatch(picture: Picture, unseen: Tensor) -> None:
 
 
 def _polarization_magnitude(stokes: Tensor) -> Tensor:
-    """Return |S1| + |S2| of Stokes vectors [3, ..., C], mean over channels."""
+    """Return |S1| + |S2| of Stokes vectors [3, ..., C], averaged over channels."""
     return stokes[1:].abs().sum(dim=0).mean(dim=-1)
 
 
@@ -211,7 +215,7 @@ def _polarization(stokes: Tensor, brightest: float) -> Picture:
 
 
 def _rounded_percentile(values: Tensor) -> float:
-    """Round the 90th percentile of values up to 1, 2 or 5 times a power of ten, at least 0.001."""
+    """Return the 90th percentile of values, rounded up to 1, 2 or 5 times a power of ten, but at least 0.001."""
     ordered = values.flatten().sort().values
     value = max(float(ordered[int(0.9 * (len(ordered) - 1))]) if len(ordered) else 0.0, 1e-3)
     power = 10.0 ** math.floor(math.log10(value))
@@ -220,11 +224,11 @@ def _rounded_percentile(values: Tensor) -> float:
 
 @torch.no_grad()
 def cross_fitted(view: View, final: Tensor, stokes: Tensor | None) -> Tensor:
-    """Predict the photograph of a view whose pictures do not determine S0.
+    """Predict the photograph of a view whose pictures do not determine S0, for a fair comparison.
 
-    Gain, angle and modulation of the analyzer are unknown and are fitted (``training.angles.fit``). The fit
-    on the left half of the picture predicts the right half, and the reverse. So no pixel is scored by a fit
-    that used it.
+    Gain, angle and modulation of the analyzer are unknown, so they are fitted (``training.angles.fit``). The fit on the
+    left half of the picture predicts the right half. The fit on the right half predicts the left half. So no pixel is
+    scored with a fit that used this pixel.
 
     Args:
         view: the view.
@@ -250,7 +254,7 @@ def cross_fitted(view: View, final: Tensor, stokes: Tensor | None) -> Tensor:
 def _behind_fitted_analyzer(
     measured: Tensor, stokes: Tensor, weight: Tensor, rays: Tensor, mount: Mount
 ) -> Tensor:
-    """Predict all pixels [H, W, 3] behind the analyzer that fits the weighted pixels."""
+    """Fit the analyzer to the weighted pixels, and predict all pixels [H, W, 3] behind it."""
     angle = fit_angle(measured, stokes, weight, rays, mount)
     if angle is None:
         counted = weight[..., None]
@@ -262,9 +266,9 @@ def _behind_fitted_analyzer(
 
 
 MINIMUM_SECONDS = 1.5
-"""Minimum duration of a measurement of speed, in seconds."""
+"""Minimum duration of a speed measurement, in seconds."""
 MOST_SECONDS = 40.0
-"""Expected duration in seconds above which views are timed once and not all of them."""
+"""Longest expected duration of a full speed measurement, in seconds. A slower one times fewer views, once each."""
 NO_PEAK = "the process used more memory before scoring"
 OTHER_WORK = "other work ran on the machine at the same time"
 
@@ -278,7 +282,7 @@ class ScoredModel(Protocol):
 
     @property
     def gaussians(self) -> int | None:
-        """Number of Gaussians; None for another representation."""
+        """Number of Gaussians, or None if the model does not consist of Gaussians."""
 
     def render(
         self, camera: Camera, *, normals: bool = True, depth: bool = False, surface: bool = False
@@ -286,10 +290,10 @@ class ScoredModel(Protocol):
         """Render the layers of a view."""
 
     def stokes(self, result: RenderResult, camera: Camera) -> Tensor | None:
-        """Predict Stokes vectors [3, H, W, 3]; None without a prediction."""
+        """Predict Stokes vectors [3, H, W, 3]; return None if the model predicts no polarization."""
 
     def alpha_in_front(self, camera: Camera, depth: Tensor) -> Tensor:
-        """Return the share of each pixel's alpha in front of a depth [H, W]."""
+        """Return the share [H, W] of each pixel's alpha that lies in front of a depth [H, W]."""
 
 
 class ScoredRun(Protocol):
@@ -330,9 +334,9 @@ def evaluate(
     """Score the test views of a run and write ``metrics.json`` and ``errors.png`` into its folder.
 
     Args:
-        run: the run. Only its layers are used.
+        run: the run to score.
         speed: measure frames per second. Other work on the machine makes this measurement invalid.
-        surface: computes the surface for the mesh scores; None fuses the depth maps.
+        surface: computes the surface for the mesh scores. None fuses rendered depth maps to a surface.
         reporter: receives progress and warnings.
 
     Returns:
@@ -396,9 +400,9 @@ def evaluate(
 
 
 def _coverage(run: ScoredRun, reporter: Reporter) -> Coverage:
-    """Find the pixels of the test views whose content a training view shows.
+    """Find the pixels of the test views whose content is visible in a training view.
 
-    Depths of test views come from the ground truth where it has them. All others are rendered.
+    The depth of a test view comes from the ground truth if it has one. All other depths are rendered.
     """
     scene = run.scene
     training = scene.train_views
@@ -448,7 +452,10 @@ def _score(
 
 
 def _peak_memory(before: float | None) -> dict[str, Any]:
-    """Return the peak memory of this process in MiB if it exceeds the peak ``before`` the scoring."""
+    """Return the peak memory of this process in MiB, or the reason why it is unknown.
+
+    The peak belongs to the scoring only if it exceeds ``before``, the peak before the scoring.
+    """
     peak = peak_memory_mib()
     if peak is None or before is None:
         return {"peak_memory_mib": None, "peak_memory_mib_reason": "the operating system does not report it"}
@@ -496,7 +503,7 @@ def _provenance(run: ScoredRun) -> dict[str, Any]:
 
 
 def frames_per_second(draw: Callable[[View], object], views: Sequence[View]) -> float | None:
-    """Measure the median over views of 1 / seconds for ``draw``.
+    """Measure the rendering speed: the median over views of 1 / seconds for ``draw``.
 
     Each view is drawn once without timing and then at least three times. If this would take longer than
     ``MOST_SECONDS``, only the first view is warmed up, and as many views as fit into that time are timed

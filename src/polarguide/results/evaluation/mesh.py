@@ -20,17 +20,17 @@ from polarguide.results.evaluation.target import jumps
 from polarguide.results.rendering.mesh import NoSurfaceError, Surface, seen_points
 
 THRESHOLDS = {"05": 0.005, "1": 0.01}
-"""Distances that count as correct, relative to the object's diagonal, by the suffix of their keys."""
+"""Distance up to which a point counts as correct, relative to the object's diagonal, by suffix of the score's key."""
 BEHIND = 0.02
-"""Distance behind the true surface, relative to the diagonal, above which a point is hidden."""
+"""Distance behind the true surface above which a point counts as hidden, relative to the diagonal."""
 SPACING = 0.002
-"""Distance of sample points on the mesh, relative to the diagonal."""
+"""Distance between sample points on the mesh, relative to the diagonal."""
 MOST_POINTS = 1_000_000
 """Approximate maximum number of sample points on the mesh."""
 TRUE_SPACING = 0.0025
-"""Maximum distance of true points on surfaces that face the camera, relative to the diagonal."""
+"""Maximum distance between neighboring true points on surfaces that face the camera, relative to the diagonal."""
 FINEST = 6
-"""Maximum upsampling of a true depth map."""
+"""Maximum factor by which the sides of a true depth map are upsampled."""
 Points = NDArray[np.float64]
 
 
@@ -38,12 +38,12 @@ def mesh_scores(surface: Callable[[], Surface], views: Sequence[View]) -> Mappin
     """Score the mesh that ``polarguide export --format mesh`` writes.
 
     Args:
-        surface: computes the mesh like the export. views: the test views; views without a true depth are
-            ignored.
+        surface: computes the mesh in the same way as the export.
+        views: the test views; views without a true depth are ignored.
 
     Returns:
-        Shares in [0, 1] by key; empty without a true depth. All are 0 if there is no surface to fuse. If a
-        package is missing, the result is only ``mesh_fscore_1_reason``.
+        Scores in [0, 1] by key; empty without a true depth. All scores are 0 if fusion finds no surface. If a package
+        is missing, the only entry is the text ``mesh_fscore_1_reason``.
     """
     measured = [
         view for view in views if view.ground_truth is not None and view.ground_truth.depth is not None
@@ -63,7 +63,7 @@ def mesh_scores(surface: Callable[[], Surface], views: Sequence[View]) -> Mappin
 
 
 def missing_package() -> str | None:
-    """Return a message if a package for meshes is not installed, else None."""
+    """Return a message about a missing package for meshes, or None if all packages are installed."""
     for module in EXPORT_PACKAGES["mesh"]:
         try:
             require_package(module, MESH_LABEL)
@@ -73,7 +73,7 @@ def missing_package() -> str | None:
 
 
 def surface_scores(surface: Surface, views: Sequence[View]) -> dict[str, float]:
-    """Score a mesh against views with true depths. At least one view must show the foreground."""
+    """Score a mesh against true depths. At least one view must show the foreground."""
     foreground = np.concatenate([true_points(view)[0] for view in views])
     low = foreground.min(axis=0)
     high = foreground.max(axis=0)
@@ -104,13 +104,13 @@ def surface_scores(surface: Surface, views: Sequence[View]) -> dict[str, float]:
 
 
 def true_points(view: View, finer: int = 1) -> tuple[Points, Points]:
-    """Return world points [M, 3] of a view's true depth: those of the foreground, and those of all pixels.
+    """Convert the true depth of a view to world points [M, 3], for the foreground and for all pixels.
 
-    The foreground is the whole picture if there is no mask.
+    Without a mask, the foreground is the whole picture.
 
     Args:
-        finer: factor on the number of points per side of the smooth parts of the foreground. Inverse depth is
-            interpolated between pixels, which is exact on planes.
+        finer: factor by which smooth parts of the foreground are upsampled per side. Inverse depth is interpolated
+            between pixels, which is exact on planes.
     """
     depth, front, known = _true_depth(view)
     camera = view.camera
@@ -125,7 +125,7 @@ def true_points(view: View, finer: int = 1) -> tuple[Points, Points]:
 
 
 def _inner(depth: Tensor, front: Tensor) -> Tensor:
-    """Return the pixels [H, W] whose neighbors all belong to the foreground and have similar depths."""
+    """Return a mask [H, W] of pixels whose neighbors all belong to the foreground and have similar depths."""
     inner = minimum_filter(front.numpy(), size=3, mode="nearest")
     return torch.from_numpy(inner & ~jumps(depth))
 
@@ -135,11 +135,11 @@ def _enlarged(values: Tensor, factor: int, mode: str) -> Tensor:
 
 
 def judged(points: Points, views: Sequence[View], reach: float) -> NDArray[np.bool_]:
-    """Return [N] bool: True for points [N, 3] that some view sees in its foreground and not behind the surface.
+    """Return a mask [N] of the points [N, 3] that are visible in the foreground of at least one view.
 
-    A point up to ``reach`` behind the true surface is visible. Pixels next to the foreground's edge or to a
-    jump of the true depth are excluded. Surfaces there are oblique, and the true points are too sparse for a
-    distance.
+    A point counts as visible if it is at most ``reach`` behind the true surface. Pixels next to the edge of the
+    foreground or to a jump of the true depth are excluded. Surfaces are oblique there, so the true points are too
+    sparse to measure a distance.
     """
     visible = torch.zeros(len(points), dtype=torch.bool)
     for view in views:
@@ -152,7 +152,7 @@ def judged(points: Points, views: Sequence[View], reach: float) -> NDArray[np.bo
 def _true_depth(view: View) -> tuple[Tensor, Tensor, Tensor]:
     """Return the true depth [H, W], the foreground pixels with a depth, and all pixels with a depth.
 
-    The foreground is the whole picture if there is no mask.
+    Without a mask, the foreground is the whole picture.
     """
     truth = view.ground_truth
     assert truth is not None
@@ -164,8 +164,8 @@ def _true_depth(view: View) -> tuple[Tensor, Tensor, Tensor]:
 def _sampled(surface: Surface, used: NDArray[np.bool_], spacing: float) -> tuple[Points, NDArray[np.float64]]:
     """Sample points [N, 3] on faces with a used vertex, and return the area [N] of each point.
 
-    Each face is divided separately into equal triangles with sides of about ``spacing``. The points are their
-    centers. So the rounding error of a vertex moves only points of its own faces.
+    Each face is divided into equal triangles with sides of about ``spacing``. The points are the centers of these
+    triangles. Faces are divided independently, so the rounding error of a vertex moves only points of its own faces.
     """
     corners = surface.vertices[surface.faces[used[surface.faces].any(axis=1)]]
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -183,7 +183,7 @@ def _sampled(surface: Surface, used: NDArray[np.bool_], spacing: float) -> tuple
 
 
 def _centers(n: int) -> Points:
-    """Return barycentric coordinates [n * n, 3] of the centers of triangles that divide each side into ``n`` parts."""
+    """Return the barycentric coordinates [n * n, 3] of the centers of n * n equal parts of a triangle."""
     first, second = np.meshgrid(np.arange(n), np.arange(n), indexing="ij")
     upright = first + second < n
     turned = first + second < n - 1
@@ -193,7 +193,7 @@ def _centers(n: int) -> Points:
 
 
 def _distances(points: Points, others: Points, farthest: float) -> Points:
-    """Return the distance from each point to the nearest other point; infinite at ``farthest`` or beyond."""
+    """Return the distance from each point to the nearest point of ``others``, or infinity from ``farthest`` on."""
     if not len(others):
         return np.full(len(points), np.inf)
     return np.asarray(cKDTree(others).query(points, distance_upper_bound=farthest)[0], np.float64)

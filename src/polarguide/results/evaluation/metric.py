@@ -1,8 +1,8 @@
 """Description of a metric: name, unit, direction, and function on a view. Installed packages can add metrics.
 
-An entry point of the group ``polarguide.metrics`` names a ``Metric`` of views, a sequence of them, or a
-function without arguments that returns either. An invalid entry point is left out with a warning, because
-scores do not depend on it.
+An entry point of the group ``polarguide.metrics`` names a ``Metric`` of views, a sequence of metrics, or a function
+without arguments that returns a metric or a sequence. An invalid entry point is skipped with a warning, because the
+other metrics do not depend on it.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from polarguide.core.records import decode
 from polarguide.results.evaluation.target import ViewTarget
 
 Layers = Mapping[str, Tensor | None]
-"""Rendered layers of a view by name, None if missing.
+"""Rendered layers of a view by name; None for a missing layer.
 
-They are ``final``, ``normal``, ``specular``, ``diffuse``, ``depth``, ``alpha``, the predicted
-``polarization`` and the alpha ``in_front`` of the surface.
+The names are ``final``, ``normal``, ``specular``, ``diffuse``, ``depth``, ``alpha``, ``polarization`` (predicted) and
+``in_front`` (the alpha in front of the surface).
 """
 Measure = Callable[[ViewTarget, Layers], Tensor | None]
-"""Function that computes a metric of a view as a tensor [], or None if it is undefined.
+"""Function that computes a metric of a view as a tensor [], or returns None if the metric is undefined.
 
 A metric in decibels returns the mean squared error.
 """
@@ -35,19 +35,20 @@ A metric in decibels returns the mean squared error.
 
 @dataclass(frozen=True)
 class Metric:
-    """A quantity of a run.
+    """Metric of a run, with its display in tables.
 
     Attributes:
         key: name in ``metrics.json``.
-        label: displayed name. unit: displayed unit, or an empty text.
+        label: displayed name.
+        unit: displayed unit, or an empty text.
         digits: decimal places in tables.
-        better: the better direction; None for neither, without bold type in tables.
-        of: "view" for a value per view and their mean for the run; "run" for one value per run.
+        better: direction of better values. None if no direction is better; then tables have no bold values.
+        of: "view" if each view has a value and the run has their mean; "run" if there is one value per run.
         measure: computes the value of a view; None for LPIPS, FLIP and metrics of a run.
         shown: "tables": console, Markdown, LaTeX and report; "files": only CSV and ``results.json``;
             "record": only ``metrics.json``.
-        timed: the value is valid only without other work on the machine, and may be missing.
-        factor: scale of the displayed value.
+        timed: True if the value is valid only without other work on the machine. Such a value may be missing.
+        factor: factor from the recorded to the displayed value.
     """
 
     key: str
@@ -63,12 +64,12 @@ class Metric:
 
     @property
     def arrow(self) -> str:
-        """Arrow toward the better side, or an empty text."""
+        """Arrow in the direction of better values, or an empty text."""
         return {"higher": "↑", "lower": "↓", None: ""}[self.better]
 
     @property
     def heading(self) -> str:
-        """Label, unit and arrow."""
+        """Heading of a column: label, unit and arrow."""
         return " ".join(filter(None, (self.label, f"({self.unit})" if self.unit else "", self.arrow)))
 
     def text(self, value: float) -> str:
@@ -128,7 +129,10 @@ def _loaded(entry: EntryPoint) -> tuple[Metric, ...]:
 
 
 class _Guarded:
-    """Measure of another package. A failure gives no value and one warning, because scores do not depend on it."""
+    """Wrapper of a measure from another package, which must not stop the scoring.
+
+    If the measure fails, the metric has no value. The first failure causes a warning.
+    """
 
     def __init__(self, entry: EntryPoint, measure: Measure) -> None:
         self._entry = entry
@@ -136,7 +140,7 @@ class _Guarded:
         self._failed = False
 
     def __call__(self, target: ViewTarget, layers: Layers) -> Tensor | None:
-        """Compute the value as a tensor [] on the target's device, or None."""
+        """Compute the value as a tensor [] on the target's device, or return None."""
         try:
             value: Any = self._measure(target, layers)
             if value is None:

@@ -25,11 +25,12 @@ from polarguide.training.photometric import SSIM_WINDOW, gaussian_window, struct
 class Selection:
     """Pixels to score, as a mask and as indices.
 
-    Picking by a mask on a device counts the mask there and makes the CPU wait. So masks are counted on the
-    CPU, and pixels are picked by index, in the order of the rows.
+    Indexing with a mask on a GPU makes the CPU wait for the number of pixels. So the indices are computed on the CPU,
+    in row order, and pixels are selected by index.
 
     Attributes:
-        mask: [H, W] bool. places: [P] int64, indices of the pixels in the mask.
+        mask: [H, W] bool.
+        places: [P] int64, indices of the pixels in the mask.
     """
 
     mask: Tensor
@@ -51,16 +52,16 @@ REFLECTIVE_SHARE = 0.3
 CLOSE_NORMAL_DEG = 11.25
 """Angle in degrees below which a normal counts as close."""
 SHORTEST = 1e-12
-"""Length at or below which a vector has no direction."""
+"""Largest length of a vector without a direction."""
 
 
 def psnr(pred_linear: Tensor, true_linear: Tensor, keep: Keep = None) -> float:
-    """Compute the peak signal-to-noise ratio of displayed pictures, in decibels, and wait for it."""
+    """Compute the peak signal-to-noise ratio of displayed pictures in decibels, and wait for the result."""
     return decibels(float(squared_error(pred_linear, true_linear, keep)))
 
 
 def decibels(error: float) -> float:
-    """Convert a mean squared error to decibels, ``-10 log10``: infinity for 0, NaN for NaN."""
+    """Convert a mean squared error to decibels; 0 gives infinity, NaN gives NaN."""
     return math.inf if error == 0 else -10 * math.log10(error)
 
 
@@ -72,8 +73,8 @@ def squared_error(
     Args:
         pred_linear, true_linear: [H, W, C] linear radiance.
         keep: [H, W] bool or a selection, the pixels to score; None scores all.
-        aligned: first scale each channel to the true picture by linear least squares. This removes errors of
-            overall brightness and tint.
+        aligned: first fit the scale of each channel to the true picture by linear least squares, which removes errors
+            of overall brightness and tint.
 
     Returns:
         []; NaN without a pixel to score.
@@ -95,9 +96,9 @@ def squared_error(
 def ssim(pred_linear: Tensor, true_linear: Tensor, keep: Keep = None, windows: Keep = None) -> Tensor:
     """Compute the structural similarity of displayed pictures (Wang et al. 2004).
 
-    The window is Gaussian, 11 x 11 pixels, sigma 1.5. K1 is 0.01, K2 is 0.03. The covariance is that of the
-    population. The result is the mean over channels and over windows inside the picture. scikit-image
-    computes the same with ``gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=1``.
+    The window is Gaussian, 11 x 11 pixels, sigma 1.5. K1 is 0.01, K2 is 0.03. The covariance is the population
+    covariance. The result is the mean over channels and over windows inside the picture. scikit-image computes the same
+    value with ``gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=1``.
 
     A pixel outside ``keep`` has no weight in any window, and the other weights are normalized to one. Windows
     centered on such a pixel are left out.
@@ -105,10 +106,10 @@ def ssim(pred_linear: Tensor, true_linear: Tensor, keep: Keep = None, windows: K
     Args:
         pred_linear, true_linear: [H, W, C] linear radiance, H and W at least 11.
         keep: [H, W] bool or a selection, the pixels to score; None scores all.
-        windows: ``window_centers`` of ``keep`` if already computed.
+        windows: result of ``window_centers`` for ``keep`` if it is already computed.
 
     Returns:
-        [], at most 1; NaN without a window.
+        [], at most 1; NaN if there is no window.
 
     Raises:
         ValueError: the shapes do not match, or the picture is smaller than the window.
@@ -131,7 +132,7 @@ def ssim(pred_linear: Tensor, true_linear: Tensor, keep: Keep = None, windows: K
 
 
 def window_centers(keep: Tensor) -> Tensor:
-    """Crop a mask [H, W] of pixels to the centers of SSIM windows [H - 10, W - 10]."""
+    """Crop a mask of pixels [H, W] to the pixels that can be centers of SSIM windows, [H - 10, W - 10]."""
     margin = SSIM_WINDOW // 2
     return keep[margin:-margin, margin:-margin]
 
@@ -143,8 +144,8 @@ def normal_angles_deg(pred: Tensor, true: Tensor) -> Tensor:
         pred, true: [..., 3] in the same axes, of any length.
 
     Returns:
-        [...] float64 in [0, 180]. A prediction without a direction (zero or not finite) counts as 90 degrees
-        off, so that holes have an error. NaN if the true vector has no direction.
+        [...] float64 in [0, 180]. A prediction without a direction (zero or not finite) has the error 90, so that holes
+        are penalized. The result is NaN if the true vector has no direction.
     """
     if pred.shape != true.shape or pred.shape[-1] != 3:
         raise ValueError(
@@ -160,7 +161,7 @@ def normal_angles_deg(pred: Tensor, true: Tensor) -> Tensor:
 
 
 def has_direction(vectors: Tensor) -> Tensor:
-    """Return [...] bool: True for vectors [..., 3] that are long enough to have a direction."""
+    """Return a mask [...] of vectors [..., 3] that are long enough to have a direction."""
     return torch.linalg.vector_norm(vectors.to(torch.float64), dim=-1) > SHORTEST
 
 
@@ -169,8 +170,8 @@ def normal_mae_deg(pred: Tensor, true: Tensor, keep: Keep = None) -> Tensor:
 
     Args:
         pred, true: [H, W, 3] in the same axes.
-        keep: pixels to score. A mask [H, W] bool may contain pixels without a true normal; they are left out.
-            A selection must not contain them. None scores all.
+        keep: pixels to score. A mask [H, W] may contain pixels without a true normal, which are left out. A selection
+            must not contain pixels without a true normal. None scores all pixels.
 
     Returns:
         [] degrees; NaN without a pixel to score.
@@ -184,7 +185,7 @@ def normal_within_11(pred: Tensor, true: Tensor, keep: Keep = None) -> Tensor:
 
 
 def layer_error(contribution: Tensor, true_s0: Tensor, keep: Keep, *, aligned: bool = False) -> Tensor:
-    """Compute the ``squared_error`` of a layer's contribution to S0/2 against the true S0 of its lobe [H, W, 3]."""
+    """Compute the ``squared_error`` between a layer's contribution to S0/2 and half of its true S0, both [H, W, 3]."""
     return squared_error(contribution, true_s0 / 2, keep, aligned=aligned)
 
 
@@ -197,8 +198,8 @@ def reflective_mask(specular: Tensor, s0: Tensor, mask: Tensor) -> Tensor:
         mask: [H, W] bool, foreground.
 
     Returns:
-        [H, W] bool: foreground pixels whose sum over channels of ``specular`` exceeds 0.3 times that of
-        ``s0``.
+        [H, W] bool: foreground pixels at which ``specular``, summed over channels, exceeds 0.3 times ``s0``, summed
+        over channels.
     """
     return mask & (specular.to(torch.float64).sum(-1) > REFLECTIVE_SHARE * s0.to(torch.float64).sum(-1))
 
@@ -228,7 +229,7 @@ def _check_pair(pred: Tensor, true: Tensor) -> None:
 
 
 def _blur(channels: Tensor) -> Tensor:
-    """Average [C, H, W] under the Gaussian window, for windows inside the picture: [C, H - 10, W - 10]."""
+    """Average channels [C, H, W] over the Gaussian windows that lie inside the picture, [C, H - 10, W - 10]."""
     kernel = gaussian_window(channels.dtype, channels.device)
     rows = functional.conv2d(channels[:, None], kernel.view(1, 1, -1, 1))
     return functional.conv2d(rows, kernel.view(1, 1, 1, -1))[:, 0]
@@ -243,15 +244,16 @@ DEPTH_BEYOND = 1.25
 
 
 def stokes_error(pred: Tensor, true: Tensor, keep: Selection, photograph: Tensor) -> Tensor:
-    """Compute the error of predicted S1 and S2: sum of |pred - true| over sum of |true|.
+    """Compute the relative error of predicted S1 and S2: the sum of |pred - true|, divided by the sum of |true|.
 
     Args:
         pred, true: [H, W, 6] linear S1, then S2, of each channel, on the scale of a picture S0/2.
-        keep: the pixels to score. photograph: [H, W, 3] linear S0/2.
+        keep: the pixels to score.
+        photograph: [H, W, 3] linear S0/2.
 
     Returns:
-        [], 0 or more; 1 for a prediction of zero. NaN without a pixel to score, or if the sum of |true| is
-        below ``LEAST_POLARIZED`` times the sum of S0.
+        [], 0 or more; 1 for a prediction of zero. NaN if there is no pixel to score, or if the sum of |true| is below
+        ``LEAST_POLARIZED`` times the sum of S0.
     """
     measured = keep.pick(true).abs().sum()
     enough = (measured > 0) & (measured >= LEAST_POLARIZED * 2 * keep.pick(photograph).sum())
@@ -260,15 +262,14 @@ def stokes_error(pred: Tensor, true: Tensor, keep: Selection, photograph: Tensor
 
 
 def depth_error_percent(pred: Tensor, true: Tensor, keep: Selection, extent: float) -> Tensor:
-    """Compute the median of |pred - true| of depths [H, W], in percent of an extent; NaN without a pixel to score."""
+    """Compute the median error of depths [H, W] in percent of ``extent``; NaN if there is no pixel to score."""
     return 100 / extent * _median((keep.pick(pred) - keep.pick(true)).abs())
 
 
 def beyond_share(pred: Tensor, true: Tensor, keep: Selection) -> Tensor:
-    """Compute the share of pixels with a depth [H, W] behind the true surface; NaN without a pixel to score.
+    """Compute the share of pixels whose depth [H, W] lies behind the true surface; NaN if there is no pixel to score.
 
-    A depth counts as behind above ``DEPTH_BEYOND`` times the true depth. An empty pixel (depth 0) counts,
-    too.
+    A pixel counts if its depth exceeds ``DEPTH_BEYOND`` times the true depth, or if it is empty (depth 0).
     """
     drawn = keep.pick(pred)
     beyond = (drawn > DEPTH_BEYOND * keep.pick(true)) | (drawn <= 0)
@@ -276,11 +277,11 @@ def beyond_share(pred: Tensor, true: Tensor, keep: Selection) -> Tensor:
 
 
 def seen_share(pred: Tensor, seen: Selection, valid: Selection) -> Tensor:
-    """Return the share of the valid pixels whose content a training view shows; NaN without valid pixels.
+    """Return the share of valid pixels whose content is visible in a training view; NaN without valid pixels.
 
     Args:
-        pred: the rendered picture, for its device.
-        seen: valid pixels whose content a training view shows.
+        pred: the rendered picture. Only its device is used.
+        seen: valid pixels whose content is visible in a training view.
         valid: the pixels that count.
     """
     share = len(seen.places) / len(valid.places) if len(valid.places) else math.nan
@@ -288,17 +289,20 @@ def seen_share(pred: Tensor, seen: Selection, valid: Selection) -> Tensor:
 
 
 def coverage_error(alpha: Tensor, mask: Tensor, keep: Selection) -> Tensor:
-    """Compute the mean |alpha - mask| of [H, W] in [0, 1]; NaN without a pixel to score."""
+    """Compute the mean of |alpha - mask| over pixels, in [0, 1]; NaN if there is no pixel to score."""
     return (keep.pick(alpha) - keep.pick(mask)).abs().mean()
 
 
 def mean_alpha(alpha: Tensor, keep: Selection) -> Tensor:
-    """Compute the mean alpha of [H, W]; NaN without a pixel to score."""
+    """Compute the mean of alpha [H, W] over pixels; NaN if there is no pixel to score."""
     return keep.pick(alpha).mean()
 
 
 def _median(values: Tensor) -> Tensor:
-    """Compute the median of [P], with the mean of the middle two for an even count; NaN for an empty tensor."""
+    """Compute the median of values [P]; NaN for an empty tensor.
+
+    The median of an even number of values is the mean of the middle two.
+    """
     count = len(values)
     if count == 0:
         return values.new_full((), torch.nan)

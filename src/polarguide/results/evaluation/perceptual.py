@@ -1,4 +1,4 @@
-"""Perceptual distances of two pictures, LPIPS and FLIP. Both are optional.
+"""Perceptual distances between two pictures: LPIPS and FLIP. Both need optional files or packages.
 
 LPIPS uses the layers of VGG-16 in plain PyTorch. Simonyan and Zisserman 2015 define the network. Zhang et al.
 2018 define the distance and its "lin" weights of the channels.
@@ -21,27 +21,27 @@ from polarguide.core.errors import PolarguideError, optional_import
 from polarguide.optics.color import shown
 
 FOLDER = "POLARGUIDE_LPIPS"
-"""Environment variable with the folder of the two files of weights."""
+"""Environment variable that names the folder with both files of weights."""
 NETWORK = "vgg16-397923af.pth"
-"""File of the network's convolutions in torch hub."""
+"""Name of the file with the network's convolutions in torch hub."""
 CHANNELS = "vgg.pth"
 HELP = "see LPIPS in docs/reference/metrics.md for the commands that install them"
 _STAGES = ((0, 2), (5, 7), (10, 12, 14), (17, 19, 21), (24, 26, 28))
-"""Indices of the convolutions between two poolings, in the numbering of the network's file."""
+"""Indices of the convolutions in each stage between two poolings, in the numbering of the network's file."""
 _SHIFT = (-0.030, -0.088, -0.188)
-"""Mean of ImageNet's colors, for values from -1 to 1."""
+"""Mean color of ImageNet, for values from -1 to 1."""
 _SCALE = (0.458, 0.448, 0.450)
-"""Standard deviation of ImageNet's colors."""
+"""Standard deviation of colors in ImageNet."""
 _LEAST_LENGTH = 1e-8
-"""Offset of squared feature lengths, against division by zero."""
+"""Offset that is added to squared feature lengths to avoid division by zero."""
 
 
 class Lpips:
     """LPIPS distance.
 
     Args:
-        network: ``features.N.weight`` and ``features.N.bias`` of the convolutions. channels:
-            ``linK.model.1.weight``.
+        network: weights of the convolutions, named ``features.N.weight`` and ``features.N.bias``.
+        channels: weights of the channels, named ``linK.model.1.weight``.
 
     Raises:
         KeyError, RuntimeError: a tensor is missing or has another shape.
@@ -88,8 +88,8 @@ class Lpips:
 def places(name: str) -> list[Path]:
     """Return the possible paths of a file of weights.
 
-    These are the folder in the environment variable if it is set; else torch's cache, and torchmetrics for
-    the weights of the channels.
+    If the environment variable is set, only its folder is searched. Otherwise it is torch's cache and, for the weights
+    of the channels, the package torchmetrics.
     """
     if folder := os.environ.get(FOLDER):
         return [Path(folder) / name]
@@ -101,7 +101,11 @@ def places(name: str) -> list[Path]:
 
 
 def load_lpips() -> tuple[Lpips | None, str | None]:
-    """Load the distance once per process and location of its files: (distance, None) or (None, reason)."""
+    """Load LPIPS once per process and location of its files.
+
+    Returns:
+        (distance, None), or (None, reason) if the weights cannot be loaded.
+    """
     files = []
     for name in (NETWORK, CHANNELS):
         file = next((path for path in places(name) if path.is_file()), None)
@@ -132,15 +136,15 @@ def lpips(
 ) -> tuple[float | None, str | None]:
     """Compute the learned perceptual distance of two displayed pictures.
 
-    The network reads whole pictures. So pixels outside ``keep`` show the true picture in both.
+    The network needs whole pictures. So both pictures show the true values outside ``keep``.
 
     Args:
         pred_linear, true_linear: [H, W, 3] linear radiance.
         keep: [H, W] bool, the pixels to score; None scores all.
 
     Returns:
-        (distance, None) with the distance 0 for equal pictures; or (None, reason) if the weights are missing
-        or the picture is smaller than 32 pixels.
+        (distance, None), with distance 0 for equal pictures. (None, reason) if the weights are missing or a side of the
+        picture is shorter than 32 pixels.
     """
     if min(pred_linear.shape[:2]) < MINIMUM_SIZE:
         return None, f"the picture is smaller than {MINIMUM_SIZE} x {MINIMUM_SIZE} pixels"
@@ -174,8 +178,8 @@ def flip(
         keep: [H, W] bool, the pixels to score; None scores all.
 
     Returns:
-        (value, None) with a value in [0, 1], 0 for equal pictures; or (None, reason) if the package is
-        missing or there is no pixel to score.
+        (value, None), with a value in [0, 1] that is 0 for equal pictures. (None, reason) if the package is missing or
+        there is no pixel to score.
     """
     package, reason = load_package()
     if package is None:
@@ -197,7 +201,11 @@ def flip(
 
 @lru_cache(maxsize=1)
 def load_package() -> tuple[Any, str | None]:
-    """Load the package ``flip_evaluator`` once per process: (package, None) or (None, reason)."""
+    """Load the package ``flip_evaluator`` once per process.
+
+    Returns:
+        (package, None), or (None, reason) if the package cannot be loaded.
+    """
     try:
         return optional_import("flip_evaluator", "FLIP"), None
     except PolarguideError:

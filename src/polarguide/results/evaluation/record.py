@@ -31,7 +31,7 @@ from polarguide.results.evaluation.table import (
 
 PACKAGE = Path(__file__).parents[2]
 COMMIT = "_commit.txt"
-"""File in an installed package with the commit of its build. It is empty if the commit is unknown."""
+"""File in an installed package that contains the commit of its build. It is empty if the commit is unknown."""
 DIGITS = 16
 NOT_TRAINING = ("results", "inspection", "viewer", "api", "cli", "__main__.py")
 """Parts of the package that training never imports."""
@@ -49,7 +49,8 @@ def code_digest(package: Path = PACKAGE, *, training: bool = False) -> str:
 
     Args:
         package: folder of the package. The bench is its sibling.
-        training: hash only code that training imports. So a change of scoring does not invalidate a training.
+        training: hash only code that training imports, so that a change of the scoring does not invalidate trained
+            runs.
     """
     compiled = [path for path in package.glob("_native.*") if path.suffix != ".pyi"]
     bench = package.with_name(BENCH)
@@ -74,7 +75,7 @@ def _digest(folder: Path, files: Sequence[Path]) -> str:
 def _code_hash(source: bytes) -> str:
     """Hash the syntax tree of a source without docstrings.
 
-    The cache saves seconds, because two digests share most files.
+    The result is cached, because the digests with and without ``training`` share most files.
     """
     tree = ast.parse(source)
     documented = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
@@ -85,15 +86,15 @@ def _code_hash(source: bytes) -> str:
 
 
 def commit(package: Path = PACKAGE) -> str | None:
-    """Return the commit of the build, or of the repository that contains the running source.
+    """Return the commit of an installed build, or of the repository that contains the running source.
 
-    An outer repository that contains the project in a subfolder does not count.
+    A repository that contains the project in a subfolder is ignored.
 
     Args:
         package: folder of the package.
 
     Returns:
-        The hash; None if it is unknown.
+        The hash of the commit, or None if it is unknown.
     """
     stamp = package / COMMIT
     if stamp.exists():
@@ -115,7 +116,7 @@ _REMEDY = "Score the run again with this version: polarguide eval."
 
 
 class Provenance(TypedDict):
-    """Facts for the repetition of a run. Additional fields are allowed."""
+    """Facts that are needed to repeat a run. Additional fields are allowed."""
 
     recipe: str
     seed: int
@@ -130,7 +131,7 @@ _Decibels = Annotated[float, msgspec.Meta(le=HIGHEST_PSNR)] | None
 
 
 def _fields(metrics: tuple[Metric, ...], *reasons: str) -> list[Any]:
-    """Return the fields of a record: metrics, and reasons for null values other than missing ground truth."""
+    """Return the fields of a record: the metrics, and texts that explain null values."""
     values: list[Any] = []
     for metric in metrics:
         kind = _Decibels if metric.unit == "dB" else float | None
@@ -189,9 +190,10 @@ def write_metrics(
     Args:
         path: the file; its folder must exist.
         views: scores by view name, at least one view.
-        run: values of ``RUN_METRICS`` by key (null if missing) and reasons for null, such as ``fps_reason``.
+        run: values of ``RUN_METRICS`` by key. A missing value is written as null. Entries such as ``fps_reason``
+            explain a null.
         provenance: the keys of ``Provenance``; other keys are allowed.
-        objects, materials: errors by object and by class of material, see ``ErrorsByObject.records``.
+        objects, materials: errors of each object and of each class of material, see ``ErrorsByObject.records``.
 
     Returns:
         The record.
@@ -261,5 +263,5 @@ def _check_reason(scores: Mapping[str, Any], where: object) -> None:
 
 
 def _finite(value: Any) -> Any:
-    """Replace a number that JSON cannot represent by None."""
+    """Replace NaN and infinity, which JSON cannot represent, by None."""
     return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -1,4 +1,4 @@
-"""Scores of one rendered view, sums of its errors by object, and means over views."""
+"""Scores of a rendered view, errors of each object, and means over views."""
 
 from __future__ import annotations
 
@@ -22,10 +22,11 @@ HALF = 0.5
 
 
 class ErrorMap(NamedTuple):
-    """Error of each pixel. The metric of a region is the sum of ``error`` over the sum of ``weight``.
+    """Error of each pixel. The metric of a region is the sum of ``error``, divided by the sum of ``weight``.
 
     Attributes:
-        error: [H, W], 0 outside the mask. weight: [H, W], 0 outside the mask.
+        error: [H, W], 0 outside the mask.
+        weight: [H, W], 0 outside the mask.
     """
 
     error: Tensor
@@ -33,10 +34,10 @@ class ErrorMap(NamedTuple):
 
 
 def error_maps(target: ViewTarget, layers: Layers) -> dict[str, ErrorMap]:
-    """Return the error maps of ``OBJECT_METRICS`` for which layers and ground truth exist, float64.
+    """Return float64 error maps of those ``OBJECT_METRICS`` for which layers and ground truth exist.
 
-    PSNR: squared error of displayed pictures, mean over channels. Normals: degrees. Stokes error: |S1 error|
-    + |S2 error|, sum over channels, with |S1| + |S2| as weight.
+    The error of a PSNR is the squared error of displayed pictures, averaged over channels. The error of normals is in
+    degrees. The Stokes error is |S1 error| + |S2 error|, summed over channels, with |S1| + |S2| as weight.
     """
     maps = {"psnr": _squared(layers["final"], target.photograph, target.valid)}
     for name in ("specular", "diffuse"):
@@ -64,7 +65,7 @@ def _squared(pred: Tensor | None, true: Tensor | None, keep: Selection | None) -
 
 
 class ErrorsByObject:
-    """Sums of errors over the pixels of each object and of each class of material in all views.
+    """Accumulator of errors over all views, for each object and each class of material.
 
     The sums stay on the device of the views until ``records`` reads them.
 
@@ -104,9 +105,9 @@ class ErrorsByObject:
         self._sums = sums if self._sums is None else self._sums + sums
 
     def records(self) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Return the errors by object name and by class of material, as in ``metrics.json``.
+        """Return the errors of each object and of each class of material, as in ``metrics.json``.
 
-        This waits for the device.
+        The call waits for the device.
         """
         if self._sums is None:
             return {}, {}
@@ -138,12 +139,11 @@ _UNDETERMINED = "the pictures of the view do not determine the Stokes vectors"
 _NO_POLARIZATION = "the measured polarization of the scored pixels is negligible"
 
 ViewScores = dict[str, float | str | None]
-"""Scores of one view by key. None means undefined: no ground truth, no such layer, or no pixel to score.
+"""Scores of one view by key. A score is None without ground truth, without the layer, or without a pixel to score.
 
-``lpips_reason``, ``flip_reason`` and ``stokes_error_reason`` explain a missing ``lpips``, ``flip`` and
-``stokes_error``.
-``nonfinite_pixels`` counts pixels with NaN or infinity in a rendered layer, if any. They are scored as black,
-and their normals as 90 degrees off.
+The texts ``lpips_reason``, ``flip_reason`` and ``stokes_error_reason`` explain why ``lpips``, ``flip`` and
+``stokes_error`` are missing. ``nonfinite_pixels`` is the number of pixels with NaN or infinity in a rendered layer. It
+is present only if there are such pixels. They are scored as black, and their normals with an error of 90 degrees.
 """
 
 
@@ -157,18 +157,19 @@ def score_view(
 ) -> ViewScores:
     """Score one rendered view on the device of its rendering.
 
-    The function waits for that device once. LPIPS waits a second time. FLIP is computed on the CPU.
+    The function reads all results from the device in one transfer, and LPIPS in a second one. FLIP is computed on the
+    CPU.
 
     Args:
         target: the ground truth of the view, on the same device.
         rendered: the rendering. Missing layers are not scored.
-        stokes: [3, H, W, 3] predicted Stokes vectors on the scale of a picture S0/2; None without a
-            prediction.
-        in_front: [H, W] share of the alpha in front of ``HAZE_DEPTH`` times the true depth; None skips haze.
+        stokes: [3, H, W, 3] predicted Stokes vectors on the scale of a picture S0/2, or None without a prediction.
+        in_front: [H, W] share of the alpha that lies in front of ``HAZE_DEPTH`` times the true depth. None skips the
+            metric of haze.
         by_object: receives the errors of the view.
 
     Returns:
-        All keys of a view. PSNRs are at most ``HIGHEST_PSNR``.
+        The score of each metric by key. PSNRs are at most ``HIGHEST_PSNR``.
 
     Raises:
         ValueError: the shapes do not match.
@@ -214,7 +215,7 @@ def score_view(
 
 
 def summarize(per_view: Mapping[str, ViewScores]) -> dict[str, float | str | None]:
-    """Return the mean of each score over the views (the mean of PSNRs, not the PSNR of the mean error).
+    """Average each score over the views. The PSNR of a run is the mean of its PSNRs, not the PSNR of its mean error.
 
     Args:
         per_view: scores by view name.
@@ -242,5 +243,5 @@ def _detached(layer: Tensor | None) -> Tensor | None:
 
 
 def _number(value: object) -> float | None:
-    """Return a finite number as float, and None for any other value."""
+    """Return a finite number as a float; return None for any other value."""
     return float(value) if isinstance(value, (int, float)) and math.isfinite(value) else None

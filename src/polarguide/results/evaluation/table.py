@@ -1,6 +1,6 @@
-"""Table of all metrics: computation on a view and display in scores, console, tables and report.
+"""Table of all metrics, which defines the computation and the display of each metric.
 
-A new metric needs a row here and a function in ``metrics.py``, or an installed package.
+To add a metric, add a row to this table and a function to ``metrics.py``, or install a package that provides it.
 """
 
 from __future__ import annotations
@@ -28,16 +28,17 @@ from polarguide.results.evaluation.metrics import (
 from polarguide.results.evaluation.target import ViewTarget
 
 HIGHEST_PSNR = 100.0
-"""Upper bound of a recorded PSNR. JSON has no infinity for equal pictures."""
+"""Upper bound of a recorded PSNR. Equal pictures have an infinite PSNR, which JSON cannot represent."""
 MESH_LABEL = "mesh F-score 1 %"
 
 
 def _comparison(compare: Callable[..., Tensor], layer: str, *known: str) -> Measure:
-    """Return a measure that compares a rendered layer with attributes of the target.
+    """Create a measure that compares a rendered layer with attributes of the target.
 
     Args:
-        compare: takes the layer and the attributes. layer: name of the layer.
-        known: names of attributes of the target, such as the true layer and a region.
+        compare: function of the layer and the attributes.
+        layer: name of the layer.
+        known: names of the attributes, such as the true layer and a region.
     """
 
     def measure(target: ViewTarget, layers: Layers) -> Tensor | None:
@@ -48,12 +49,12 @@ def _comparison(compare: Callable[..., Tensor], layer: str, *known: str) -> Meas
 
 
 def _layer(name: str, *, aligned: bool = False, region: str = "foreground") -> Measure:
-    """Return the measure of the squared error of a layer against its true lobe in a region."""
+    """Create a measure for the squared error of a layer, such as specular, in a region of the picture."""
     return _comparison(partial(layer_error, aligned=aligned), name, name, region)
 
 
 def _mesh(key: str, label: str, *, shown: Literal["tables", "files"] = "files") -> Metric:
-    """Return a metric of the mesh in percent."""
+    """Create a metric of the mesh in percent."""
     return Metric(key, label, "%", 1, "higher", of="run", shown=shown, factor=100.0)
 
 
@@ -239,31 +240,31 @@ BUILT_IN_METRICS: tuple[Metric, ...] = (
     Metric("steps", "steps", "", 0, None, of="run", shown="record"),
     Metric("peak_memory_mib", "peak memory", "MiB", 0, "lower", of="run", shown="record"),
 )
-"""Metrics of this package."""
+"""Metrics that this package defines."""
 PLUGGED = plugged_metrics({metric.key for metric in BUILT_IN_METRICS})
-"""Metrics of installed packages."""
+"""Metrics that other installed packages define."""
 METRICS = (*BUILT_IN_METRICS, *PLUGGED)
 """All metrics in the order of display."""
 OBJECT_METRICS = ("psnr", "normal_mae_deg", "specular_psnr", "diffuse_psnr", "stokes_error")
-"""Keys of the metrics that are recorded by object and by material."""
+"""Keys of the metrics that are recorded for each object and each material."""
 VIEW_METRICS = tuple(metric for metric in METRICS if metric.of == "view")
-"""Metrics of a view. A run records their means over views."""
+"""Metrics with a value for each view. A run records the mean over views."""
 RUN_METRICS = tuple(metric for metric in METRICS if metric.of == "run")
-"""Metrics of a run. Each may be null."""
+"""Metrics with one value for a run. Each value may be null."""
 COLUMNS = tuple(metric for metric in METRICS if metric.shown != "record")
-"""Metrics that comparisons collect."""
+"""Metrics that a comparison of runs collects."""
 METAL_SHARE = Metric("metal_share", "taken for metal", "%", 1, None, factor=100.0)
 """Share of the pixels of an object with a metalness above one half, for recipes with metals."""
 PART_METRICS = (*(metric for metric in COLUMNS if metric.of == "view"), METAL_SHARE)
-"""Metrics of an object or a class of material."""
+"""Metrics of an object or of a class of material."""
 
 
 def shown_metrics(record: Mapping[str, Any], *, scores_only: bool = False) -> list[tuple[str, str]]:
     """Return the labels and values of the metrics of a run in the order of the table.
 
-    A metric without a value shows "n/a" and a short reason; ``explained`` returns the long reasons. A metric
-    without a value and without a reason is left out, see ``absent_metrics``. The PSNR of the worst view
-    follows the mean PSNR.
+    A metric without a value is shown as "n/a" with a short reason; ``explained`` returns the long reasons. A metric
+    without a value and without a reason is left out, see ``absent_metrics``. The PSNR of the worst view is listed after
+    the mean PSNR.
 
     Args:
         record: record of a run from ``metrics.json``.
@@ -287,7 +288,7 @@ def shown_metrics(record: Mapping[str, Any], *, scores_only: bool = False) -> li
 
 
 def explained(record: Mapping[str, Any]) -> list[str]:
-    """Return one line of explanation for each metric that ``shown_metrics`` shows as "n/a"."""
+    """Return one line for each metric that ``shown_metrics`` shows as "n/a", with the reason."""
     reasons = {
         metric.label: str(record.get(f"{metric.key}_reason") or "").partition(": ")[2]
         for metric in METRICS
@@ -297,7 +298,7 @@ def explained(record: Mapping[str, Any]) -> list[str]:
 
 
 def _worst_view(record: Mapping[str, Any], metric: Metric) -> list[tuple[str, str]]:
-    """Return the lowest value of a metric among the views and its view; empty for fewer than two views."""
+    """Return the lowest value of a metric and its view as a line of the table; empty for fewer than two views."""
     scored = {name: s[metric.key] for name, s in record.get("views", {}).items() if s[metric.key] is not None}
     if len(scored) < 2:
         return []
@@ -306,7 +307,10 @@ def _worst_view(record: Mapping[str, Any], metric: Metric) -> list[tuple[str, st
 
 
 def absent_metrics(record: Mapping[str, Any]) -> list[str]:
-    """Return the labels of metrics without a value and without a recorded reason (no ground truth or no such layer)."""
+    """Return the labels of metrics without a value for which no reason is recorded.
+
+    Either the ground truth or the layer is missing.
+    """
     return [
         metric.label
         for metric in METRICS

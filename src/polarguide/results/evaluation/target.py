@@ -20,11 +20,11 @@ from polarguide.capture.view import listed
 from polarguide.results.evaluation.metrics import Selection, has_direction, reflective_mask, window_centers
 
 EXTENT = 1.1
-"""Extent of a scene, relative to the largest distance between two of its cameras."""
+"""Ratio of the extent of a scene to the largest distance between two of its cameras."""
 BLACK_SHARE = 0.99
-"""Share of black pixels outside the masks above which the pictures show only the foreground."""
+"""Share of black pixels outside the masks above which the pictures are assumed to show only the foreground."""
 MARGIN = 3
-"""Width in pixels of the border around a mask that belongs to no region."""
+"""Width of the border around a mask that counts neither as foreground nor as outside, in pixels."""
 KNOWN = {
     "mask": "masks",
     "normal": "normals",
@@ -38,17 +38,17 @@ KNOWN = {
 
 @dataclass(frozen=True, eq=False)
 class SceneFacts:
-    """Facts of all test views of a scene.
+    """Facts about all test views of a scene, for their scores.
 
     Attributes:
         extent: 1.1 times the largest distance between two cameras, in world units.
-        objects: objects with recorded errors: those of the foreground, if object numbers and a table of
-            objects exist.
-        masks: foreground [H, W] bool of each test view, from the ground truth or else from the user; None if
-            a view has no mask.
+        objects: foreground objects whose errors are recorded; empty if object numbers or the table of objects are
+            missing.
+        masks: foreground [H, W] bool of each test view, from the ground truth or, without one, from the user. None if a
+            view has no mask.
         object_only: True if the pictures show only the foreground: more than 99 % of the pixels farther than
             3 pixels from the masks are black.
-        warnings: limits of the scores because of missing data, one sentence each.
+        warnings: sentences about scores that are limited because data is missing.
     """
 
     extent: float
@@ -59,7 +59,7 @@ class SceneFacts:
 
     @classmethod
     def of(cls, scene: Scene) -> SceneFacts:
-        """Collect the facts of the test views of a scene."""
+        """Collect the facts about the test views of a scene."""
         tests = scene.test_views
         centers = torch.stack([view.camera.center for view in scene.views]).numpy()
         warnings = _partial_truth_warnings(tests)
@@ -86,13 +86,16 @@ class SceneFacts:
 
 
 def foreground(view: View) -> Tensor | None:
-    """Return the foreground [H, W] bool: the mask of the ground truth, else that of the user, else None."""
+    """Return the foreground mask [H, W] of a view.
+
+    The mask of the ground truth has priority over the mask of the user. Return None if there is no mask.
+    """
     truth = view.ground_truth
     return truth.mask if truth is not None and truth.mask is not None else view.mask
 
 
 def outside(mask: Tensor) -> Tensor:
-    """Return the pixels [H, W] bool that are more than ``MARGIN`` rows or columns away from a mask."""
+    """Return a mask [H, W] of the pixels that are more than ``MARGIN`` rows or columns away from ``mask``."""
     grown = binary_dilation(mask.numpy(), structure=torch.ones(3, 3).numpy(), iterations=MARGIN)
     return torch.from_numpy(~grown)
 
@@ -152,37 +155,40 @@ def _object_warnings(scene: Scene, views: Sequence[View]) -> list[str]:
 
 
 JUMP = 1.05
-"""Ratio of neighboring true depths above which they belong to different surfaces."""
+"""Ratio of neighboring true depths above which the pixels belong to different surfaces."""
 JUMP_MARGIN = 2
-"""Distance in pixels to a jump of depth below which a pixel is not smooth."""
+"""Minimum distance of a smooth pixel from a jump of depth, in pixels."""
 
 
 @dataclass(frozen=True, eq=False)
 class ViewTarget:
-    """Photograph, ground truth and scored pixels of a view, on one device; floats are float64.
+    """Photograph, ground truth and pixels to score of a view, on one device; floats are float64.
 
-    Missing data gives None.
+    An attribute is None if its data is missing.
 
     Attributes:
         photograph: [H, W, 3] linear, S0/2.
-        valid: pixels of the photograph to score. windows: those that are centers of SSIM windows.
-        foreground: valid pixels of the true mask. Without a mask, this and all fields up to ``diffuse`` are
-            missing.
+        valid: pixels of the photograph to score.
+        windows: pixels of ``valid`` that are centers of SSIM windows.
+        foreground: valid pixels of the true mask. Without a mask, this attribute and all attributes up to ``diffuse``
+            are None.
         reflective: foreground pixels dominated by reflection.
         surface: foreground pixels with a true normal.
-        normal: [H, W, 3] world. specular, diffuse: [H, W, 3] linear S0 of the lobes.
+        normal: [H, W, 3] world.
+        specular, diffuse: [H, W, 3] true linear S0 of the layer.
         polarization: measured S1, then S2, of each channel, [H, W, 6] linear.
-        polarized: pixels for the Stokes error: valid, not saturated, and foreground if masks are known.
-        owner: index of each pixel's object in ``SceneFacts.objects``, or their number for no object, [H, W]
-            int64.
+        polarized: pixels for the Stokes error. They are valid, not saturated, and in the foreground if masks are known.
+        owner: [H, W] int64, index of each pixel's object in ``SceneFacts.objects``. A pixel without an object has the
+            number of objects as its index.
         dielectric: foreground pixels of objects that are known to be dielectric.
-        depth: [H, W] true camera depth, 0 if unknown. near: pixels for the depth error: foreground pixels
-            with a true depth, or all pixels with a true depth if there is no mask.
-        smooth: valid pixels with a true depth, at least 2 pixels from any jump of it.
-        mask: [H, W] float64, 1 in the foreground; only if the pictures show nothing else.
-        beyond: valid pixels more than 3 pixels outside that mask.
-        seen: valid pixels whose content a training view shows; None if not determined.
-        seen_windows: those that are centers of SSIM windows. seen_polarized: those of ``polarized``.
+        depth: [H, W] true camera depth, 0 if unknown.
+        near: pixels for the depth error: pixels with a true depth, restricted to the foreground if there is a mask.
+        smooth: valid pixels with a true depth and without a jump of depth within 2 pixels.
+        mask: [H, W] float64, 1 in the foreground, if the pictures show only the foreground; otherwise None.
+        beyond: valid pixels more than 3 pixels outside ``mask``.
+        seen: valid pixels whose content is visible in a training view, or None if this was not determined.
+        seen_windows: pixels of ``seen`` that are centers of SSIM windows.
+        seen_polarized: pixels of ``seen`` that are also in ``polarized``.
         extent: extent of the scene in world units.
     """
 
@@ -217,8 +223,8 @@ class ViewTarget:
 
         Args:
             photograph: [H, W, 3] linear, S0/2.
-            invalid: [H, W] bool, pixels without a valid value (saturated, dark, no data), excluded from all
-                scores; None for none.
+            invalid: [H, W] bool, pixels without a valid value (saturated, dark, no data), which no score counts. None
+                if all pixels are valid.
             ground_truth: None, or an object with optional attributes: ``mask`` [H, W] bool, ``normal`` [H, W,
                 3] world, ``specular`` and ``diffuse`` [H, W, 3] linear S0 of the lobes, ``depth`` [H, W].
             device: device of the rendering.
@@ -257,7 +263,7 @@ class ViewTarget:
 
     @classmethod
     def of_view(cls, view: View, facts: SceneFacts, device: torch.device) -> ViewTarget:
-        """Return the target of a test view with the facts of its scene."""
+        """Create the target of a test view from the view and the facts about its scene."""
         target = cls.of(view.photograph(), view.invalid, view.ground_truth, device)
         masks = facts.masks
         truth = view.ground_truth
@@ -289,11 +295,11 @@ class ViewTarget:
 
     @property
     def unseen(self) -> Tensor:
-        """Valid pixels [H, W] bool whose content no training view shows; none if not determined."""
+        """Mask [H, W] of valid pixels that are visible in no training view; all False if this was not determined."""
         return self.valid.mask & ~(self.valid if self.seen is None else self.seen).mask
 
     def with_coverage(self, seen: Tensor) -> ViewTarget:
-        """Return the target with the pixels [H, W] bool (CPU) whose content a training view shows."""
+        """Return the target with a mask [H, W] on the CPU of pixels whose content is visible in a training view."""
         device = self.photograph.device
         counted = seen & self.valid.mask.cpu()
         polarized = None if self.polarized is None else counted & self.polarized.mask.cpu()
@@ -306,17 +312,18 @@ class ViewTarget:
 
 
 def without_jumps(depth: Tensor) -> Tensor:
-    """Return [H, W] bool: True for pixels with a depth and without a jump of depth within 2 pixels.
+    """Return a mask [H, W] of pixels with a depth and without a jump of depth within 2 pixels.
 
-    A square of 3 x 3 pixels has a jump if its largest depth exceeds 1.05 times the smallest, or if a depth is
-    missing. A pixel is smooth if the square of 5 x 5 pixels around it contains no such square.
+    A square of 3 x 3 pixels has a jump if its largest depth exceeds 1.05 times its smallest depth, or if one of its
+    depths is missing. The mask contains a pixel if no square of 3 x 3 pixels inside the 5 x 5 pixels around it has a
+    jump.
     """
     near_jump = maximum_filter(jumps(depth), size=2 * JUMP_MARGIN - 1, mode="nearest")
     return (depth > 0) & torch.from_numpy(~near_jump)
 
 
 def jumps(depth: Tensor) -> NDArray[np.bool_]:
-    """Return [H, W] bool: True if a depth [H, W] jumps in the square of 3 x 3 pixels around a pixel."""
+    """Return a mask [H, W] of pixels with a jump of depth within the 3 x 3 pixels around them."""
     values = depth.double().numpy()
     low, high = (f(values, size=3, mode="nearest") for f in (minimum_filter, maximum_filter))
     return np.asarray(high > JUMP * low)

@@ -1,6 +1,7 @@
-"""Adapters of shading models for exported files: fields of a PLY and data of a web page, selected by the model's class.
+"""Conversion of shading models to exported files: fields of a PLY file and data of a web page.
 
-A plug-in registers functions for its class with ``@ply_fields.register`` and ``@page_shading.register``.
+The class of the model selects the function. A plug-in registers functions for its own class with
+``@ply_fields.register`` and ``@page_shading.register``.
 """
 
 from __future__ import annotations
@@ -34,11 +35,11 @@ SURROUNDINGS_NOTE = (
 
 @dataclass(frozen=True, eq=False)
 class PageShading:
-    """Data for shading Gaussians in an exported page.
+    """Data with which an exported web page shades Gaussians.
 
     Attributes:
-        kind: preprocessor symbol of the page's shaders, in lower case.
-        values: values per Gaussian, [N, ...], by the names of ``results.export.web_page.SLOTS``.
+        kind: preprocessor symbol that selects the code in the page's shaders, in lower case.
+        values: values of the Gaussians, [N, ...], by name. ``results.export.web_page.SLOTS`` lists the names.
         light: cubemaps [6, R, R, C], finest first.
         network: matrices [rows, columns] in the order of the shaders.
         constants: additional entries of the page's scene, plain JSON values.
@@ -55,9 +56,9 @@ class PageShading:
 
 @singledispatch
 def ply_fields(shading: ShadingModel, gaussians: Parameters) -> dict[str, Tensor]:
-    """Return the fields of a PLY in addition to display colors, [N, ...] by name.
+    """Return additional fields of a PLY file, [N, ...] by name.
 
-    They are linear harmonics and surface properties.
+    They are linear harmonics and surface properties. The display colors are always written.
     """
     harmonics = {"linear_dc": gaussians["sh_dc"], "linear_rest": gaussians["sh_rest"].flatten(1)}
     return harmonics | {row.name: row.values(gaussians) for row in shading.surface}
@@ -93,7 +94,10 @@ def _(shading: DirectionalShading, gaussians: Parameters) -> dict[str, Tensor]:
 
 @singledispatch
 def page_shading(shading: ShadingModel, gaussians: Parameters, light: Light) -> PageShading | None:
-    """Return the data of an exported page, or None if the page has no shaders for the model and colors are baked."""
+    """Return the data with which a page shades Gaussians.
+
+    Return None if the page has no shaders for the model. Then the colors are baked into the Gaussians.
+    """
     return None
 
 
@@ -103,13 +107,13 @@ def _harmonics(gaussians: Parameters) -> dict[str, Tensor]:
 
 @page_shading.register
 def _(shading: PlainShading, gaussians: Parameters, light: Light) -> PageShading | None:
-    """Return the harmonics."""
+    """Return the harmonics of the colors."""
     return PageShading("plain", _harmonics(gaussians))
 
 
 @page_shading.register
 def _(shading: DeferredShading, gaussians: Parameters, light: Light) -> PageShading | None:
-    """Return harmonics, strength and texels, and the reflectance and blur of metals."""
+    """Return harmonics, reflection strength and texels of the environment, and for metals reflectance and blur."""
     own = surface_channels(shading.surface, gaussians)
     if not shading.local and (shading.rough or "metalness" in own):
         return None  # No recipe has such surfaces.
@@ -150,8 +154,8 @@ def _at_45_degrees(index: Tensor | float) -> Tensor:
 def _(shading: DirectionalShading, gaussians: Parameters, light: Light) -> PageShading | None:
     """Return albedo, roughness, features, the levels of the grid, and the MLP.
 
-    A record holds either features or harmonics. So the surroundings have their mean color and zero features, and the
-    page recognizes them by these.
+    The record of a Gaussian has space for either features or harmonics. So a Gaussian of the surroundings has its mean
+    color instead of harmonics, and its features are zero. The page recognizes the surroundings by their zero features.
     """
     fields = ply_fields(shading, gaussians)
     surface = gaussians["surface"]

@@ -1,6 +1,6 @@
 """Export of a run to the file formats of other programs.
 
-``model.json`` of a package states units, axes, origin, cameras, scores, and unknown quantities.
+The file ``model.json`` of a package states units, axes, provenance, cameras, scores, and unknown quantities.
 """
 
 from __future__ import annotations
@@ -77,11 +77,11 @@ TRANSFORMS = "transforms.json"
 def export_cameras(run: OpenedRun, presented: Presented, folder: Path, reporter: Reporter) -> list[Path]:
     """Write ``sparse/0`` (COLMAP), ``transforms.json`` and the photographs in ``images/``.
 
-    The cameras are pinholes. So the images are undistorted, have the cameras' size, and show the color of the
+    The cameras are pinholes, so the images are undistorted and have the size of the cameras. They show the color of the
     presentation (8 bits, sRGB).
 
     Raises:
-        PolarguideError: the folder contains pictures or a model that no export wrote.
+        PolarguideError: the folder contains pictures or a model that were not exported by this program.
     """
     model = folder / "sparse" / "0"
     images = folder / IMAGES
@@ -130,16 +130,17 @@ FILES = {
 
 
 def about_files(names: list[str]) -> dict[str, str]:
-    """Return the descriptions of files by name."""
+    """Return a description of each file by name."""
     return {name: FILES[name] for name in names}
 
 
 def package_record(run: OpenedRun, placement: Placement, origin: Origin, base_color: str) -> dict[str, Any]:
-    """Return the record of a package without its files.
+    """Return the content of ``model.json`` except the list of files.
 
     Args:
-        run: the run; its scene is read. placement: placement of the files (+y up). origin: author and
-            provenance.
+        run: the run; its scene is read.
+        placement: placement of the files (+y up).
+        origin: author and provenance.
         base_color: description of the base color.
     """
     unknown = [
@@ -169,9 +170,9 @@ def package_record(run: OpenedRun, placement: Placement, origin: Origin, base_co
 
 
 PANORAMA_HEIGHT = 512
-"""Rows of an exported environment map."""
+"""Number of rows of an exported environment map."""
 MILLIMETERS = 1000.0
-"""Millimeters per meter. Slicers interpret the numbers of an STL file as millimeters."""
+"""Millimeters per meter. An STL file has no unit, and slicers assume millimeters."""
 
 
 def export(
@@ -186,22 +187,22 @@ def export(
     model: ModelOptions = ModelOptions(),
     reporter: Reporter = SILENT,
 ) -> list[Path]:
-    """Export a run with its presentation: its subject, in its color, in meters, upright.
+    """Export a run: its subject upright, in meters, and in the color of its presentation.
 
     Args:
         run: the run. The formats ply, spz and sog read only poses and masks of its scene.
-        format: one of these formats. Splats (ply, spz, sog, splat-glb, splat-usdz) have reflections baked into
-            harmonics. The mesh (GLB and PLY) is fused from rendered depth and has diffuse colors and learned normals.
-            The textured model is glb, obj or usdz, and its closed surface stl. The points are opaque Gaussians with
-            normals. The environment is the learned light as a panorama (EXR, HDR and PNG). The cameras are a COLMAP
-            model and transforms.json.
+        format: format of the file. Splats (ply, spz, sog, splat-glb, splat-usdz) have reflections baked into harmonics.
+            The mesh (GLB and PLY) is fused from rendered depth and has diffuse colors and learned normals. The textured
+            model is glb, obj or usdz, and its closed surface stl. The points are opaque Gaussians with normals. The
+            environment is the learned light as a panorama (EXR, HDR and PNG). The cameras are a COLMAP model and
+            transforms.json.
         out: folder to write; default: ``export`` in the run's folder.
         resolution: number of voxels of the mesh along its longest side, 16 to 1024.
-        spz_version: version of the SPZ file, 3 or 4. Readers support one of them.
-        fields: fields of ply: release are the 62 floats of the 3DGS release; all adds polarguide.ply with
-            linear fields.
-        axes: upright (+y in GLB and USD, -y in other files) or scene (the scene's own axes, except in GLB and
-            USD).
+        spz_version: version of the SPZ file, 3 or 4. Most programs can read only one of the versions.
+        fields: fields of a PLY file. release writes the 62 floats of the 3DGS release. all also writes polarguide.ply
+            with linear fields.
+        axes: upright turns the scene so that up is +y in GLB and USD files, and -y in other files. scene keeps the axes
+            of the scene, except in GLB and USD files.
         model: options of the textured model.
         reporter: receives the progress.
 
@@ -209,7 +210,7 @@ def export(
         The written files and folders.
 
     Raises:
-        PolarguideError: a package is missing, or the recipe has no data for the format.
+        PolarguideError: a package is missing, or the recipe does not learn the data that the format needs.
     """
     folder = run.folder / "export" if out is None else Path(out)
     if out is None:
@@ -236,7 +237,7 @@ def export(
 
 @dataclass(frozen=True, eq=False)
 class _Exporter:
-    """Export of one run to a folder; see ``export``. Methods return the written files."""
+    """Export of one run to a folder; see ``export``. Each method writes one format and returns the written files."""
 
     run: OpenedRun
     presented: Presented
@@ -281,14 +282,14 @@ class _Exporter:
     def _from_ply(
         self, name: str, write: Callable[[Path, Path], None], placement: Placement | None = None
     ) -> list[Path]:
-        """Write a file by a function of its path and the path of a temporary PLY."""
+        """Write a temporary PLY file, and call ``write`` to convert it to the file ``name``."""
         path = self.folder / name
         with temporary_folder(path.with_suffix(".ply")) as parts:
             write(path, self._ply(parts / "splats.ply", placement))
         return [path]
 
     def spz(self) -> list[Path]:
-        """Write SPZ in units of the scene, because the format rounds positions to 1/4096 of a unit."""
+        """Write an SPZ file in units of the scene, because the format rounds positions to 1/4096 of a unit."""
         # Readers expect +y up and revert this half turn.
         half_turn = torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))
         rotation = half_turn @ self.presented.placement.rotation
@@ -304,7 +305,7 @@ class _Exporter:
         return self._from_ply("splats.sog", partial(write_sog, asset=asset))
 
     def splat_glbs(self) -> list[Path]:
-        """Write splats as GLB, one file for each encoding of colors."""
+        """Write splats as GLB files, one for each encoding of colors."""
         placement = self.presented.upright(self.run)
         paths: dict[Encoding, Path] = {kind: self.folder / f"splats-{kind}.glb" for kind in COLOR_SPACES}
         with temporary_folder(self.folder / "splats.ply") as parts:
@@ -314,7 +315,7 @@ class _Exporter:
         return [*paths.values()]
 
     def splat_usdz(self) -> list[Path]:
-        """Write splats as USDZ with encoded colors. USD does not define their color space."""
+        """Write splats as a USDZ file with sRGB-encoded colors. USD does not define the color space of splats."""
         placement = self.presented.upright(self.run)
         about = asset_record(placement, self.presented.origin)
         return self._from_ply("splats.usdz", partial(write_splat_usdz, about=about), placement)
@@ -361,7 +362,7 @@ class _Exporter:
         return [path]
 
     def stl(self) -> list[Path]:
-        """Write a closed surface for 3D printing: +z up, in millimeters if the scale is known."""
+        """Write a closed surface for 3D printing, with +z up and in millimeters if the scale is known."""
         presented = self.presented
         surface, _, _ = subject_surface(
             self.run,
@@ -384,7 +385,11 @@ class _Exporter:
         return [path]
 
     def all(self) -> list[Path]:
-        """Write a package: lit and unlit model, splats, environment map, preview, and the record ``model.json``."""
+        """Write a package of files for other programs.
+
+        It contains the model with and without shading, splats, an environment map, a preview, and the record
+        ``model.json``.
+        """
         run = self.run
         lit = replace(self.options, unlit=False)
         radiant = run.model.shading.radiance_cubemap is not None

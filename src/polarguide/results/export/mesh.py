@@ -46,8 +46,10 @@ def write_mesh(
     """Write a mesh as PLY with display colors, or as GLB (+y up) with linear colors.
 
     Args:
-        path: the file, .ply or .glb. mesh: the mesh in the scene's axes. around: the scene's frame.
-        placement: placement of the PLY. The GLB uses only its scale.
+        path: the file, .ply or .glb.
+        mesh: the mesh in the scene's axes.
+        around: the scene's frame.
+        placement: placement of a PLY file. A GLB file uses only the scale of the placement.
         origin: author and provenance.
     """
     surface = mesh.surface
@@ -73,7 +75,10 @@ def write_mesh(
 
 
 def asset_record(placement: Placement, origin: Origin) -> dict[str, Any]:
-    """Return the asset record of a glTF file. The unit of glTF is the meter; ``units`` states an unknown scale."""
+    """Return the asset record of a glTF file.
+
+    The unit of glTF is the meter. If the scale of the scene is unknown, the field ``units`` states this.
+    """
     units = "meters" if placement.metric else "units of the scene; their length is unknown"
     credit = origin.presentation.credit
     return {
@@ -86,7 +91,7 @@ def asset_record(placement: Placement, origin: Origin) -> dict[str, Any]:
 DIELECTRIC = {"metallicFactor": 0.0, "roughnessFactor": 1.0}
 """glTF material that shows vertex colors as a diffuse surface."""
 OPAQUE = 0.5
-"""Opacity above which a Gaussian belongs to a surface."""
+"""Minimum opacity of a Gaussian that belongs to a surface."""
 FIELDS = [(name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")] + [
     (name, "u1") for name in ("red", "green", "blue")
 ]
@@ -99,7 +104,7 @@ def surface_points(
     views: Iterable[View],
     rasterize: Rasterize,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return positions, outward unit normals and linear diffuse colors, each [M, 3], of visible opaque Gaussians.
+    """Return positions, outward unit normals and linear diffuse colors of visible opaque Gaussians, each [M, 3].
 
     Raises:
         PolarguideError: no opaque Gaussian is visible in any view.
@@ -132,11 +137,14 @@ def write_points(
     comments: Sequence[str] = (),
     faces: NDArray[np.int64] | None = None,
 ) -> None:
-    """Write a PLY of points with comments.
+    """Write a PLY file of points, or of a mesh, with comments.
 
     Args:
-        path: the file. points, normals: [M, 3]. colors: [M, 3] encoded, in [0, 1].
-        comments: lines of the header. faces: [F, 3] of a mesh; None for a point cloud.
+        path: the file.
+        points, normals: [M, 3].
+        colors: [M, 3] encoded, in [0, 1].
+        comments: comment lines of the header.
+        faces: [F, 3] of a mesh; None for a point cloud.
     """
     values = np.concatenate((points.numpy(), normals.numpy(), np.rint(colors.numpy() * 255)), axis=1)
     table = unstructured_to_structured(values, np.dtype(FIELDS))

@@ -1,4 +1,4 @@
-"""Presentation of a run in exported files: subject, axes, units, comments, provenance, and camera poses."""
+"""Presentation of a run in exported files: subject, axes, units, comments, provenance and camera poses."""
 
 from __future__ import annotations
 
@@ -39,12 +39,13 @@ from polarguide.shading.result import RenderResult
 
 @dataclass(frozen=True, eq=False)
 class Placement:
-    """Placement of exported files: a rotation and a scale of the scene.
+    """Rotation and scale from the scene to an exported file.
 
     Attributes:
         rotation: [3, 3] float64, from the scene's axes to the file's.
         scale: units of the file per unit of the scene, positive.
-        metric: the file's unit is the meter. upright: up is -y in the file.
+        metric: True if the unit of the file is the meter.
+        upright: True if up is -y in the file.
     """
 
     rotation: Tensor
@@ -54,13 +55,13 @@ class Placement:
 
     @classmethod
     def of(cls, presentation: Presentation, around: SceneFrame | None) -> Placement:
-        """Return a placement in meters if the scale is known, with -y up or in the scene's own axes.
+        """Create a placement in meters if the scale is known, with -y up or in the axes of the scene.
 
-        In files of Gaussians up is -y, as in the axes of a photograph: x right, y down, z forward.
+        Up is -y in files of Gaussians, because their axes are camera axes: x right, y down, z forward.
 
         Args:
             presentation: presentation of the run.
-            around: the scene's frame with its up axis; None keeps the scene's own axes.
+            around: the scene's frame with its up axis. None keeps the axes of the scene.
         """
         scale = presentation.meters_per_unit
         rotation = torch.eye(3, dtype=torch.float64)
@@ -71,7 +72,7 @@ class Placement:
 
     @property
     def rotates(self) -> bool:
-        """True if the axes of the file differ from the scene's."""
+        """True if the axes of the file differ from the axes of the scene."""
         return not torch.equal(self.rotation, torch.eye(3, dtype=torch.float64))
 
     @property
@@ -80,31 +81,32 @@ class Placement:
         return self.rotates or self.scale != 1.0
 
     def points(self, places: Tensor) -> Tensor:
-        """Convert points [N, 3] of the scene to the file."""
+        """Convert points [N, 3] from the scene to the file."""
         return self.scale * self.directions(places)
 
     def directions(self, vectors: Tensor) -> Tensor:
-        """Convert directions [N, 3] of the scene to the file."""
+        """Convert directions [N, 3] from the scene to the file."""
         return vectors @ self.rotation.T.to(vectors)
 
     def camera(self, camera: Camera) -> Camera:
-        """Convert a camera of the scene to the file."""
+        """Convert a camera from the scene to the file."""
         return Camera(
             camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy,
             camera.rotation @ self.rotation.T, self.scale * camera.translation,
         )  # fmt: skip
 
     def harmonics(self) -> NDArray[np.float64]:
-        """Return the rotation of harmonics of degree 1 to 3 as a matrix [15, 15]: new = matrix @ old.
+        """Return the matrix [15, 15] that rotates spherical harmonics of degrees 1 to 3: new = matrix @ old.
 
-        Each degree is closed under rotations, so that a fit to samples is exact.
+        The matrix is fitted to samples. The fit is exact, because a rotation maps the harmonics of a degree to
+        harmonics of the same degree.
         """
         directions = spread_directions(64)
         before = sh_basis(directions @ self.rotation, 3)[:, 1:]
         return np.asarray(torch.linalg.lstsq(sh_basis(directions, 3)[:, 1:], before).solution.numpy())
 
     def place(self, table: NDArray[Any]) -> None:
-        """Transform the Gaussians of a PLY, a structured array in the layout of ``write_ply``, in place."""
+        """Transform Gaussians in place. They are a structured array in the layout of ``write_ply``."""
         if not self.changes:
             return
         rotation = self.rotation.numpy()
@@ -137,7 +139,7 @@ class Placement:
 
 
 def _transform(table: NDArray[Any], names: Sequence[str], matrix: NDArray[np.float64]) -> None:
-    """Multiply the vectors in some fields of a structured array by a matrix, in place."""
+    """Multiply the vectors whose components are the fields ``names`` of a structured array by a matrix, in place."""
     values = np.stack([table[name] for name in names]).astype(np.float64)
     for name, column in zip(names, matrix @ values, strict=True):
         table[name] = column
@@ -148,14 +150,15 @@ class Origin:
     """Author and provenance of a file.
 
     Attributes:
-        presentation: author, license, provenance and title. made_of: recipe, steps and digest of the scene.
+        presentation: author, license, provenance and title.
+        made_of: recipe, number of steps and digest of the scene.
     """
 
     presentation: Presentation
     made_of: str
 
     def record(self) -> dict[str, str]:
-        """Return the known values under Sketchfab's names of the extras of a glTF asset."""
+        """Return the known values as extras of a glTF asset, with the names that Sketchfab uses."""
         presentation = self.presentation
         texts = {
             "title": presentation.title,
@@ -179,7 +182,7 @@ def comments(origin: Origin, placement: Placement) -> list[str]:
 
 
 def _ascii(value: Any) -> str:
-    """Convert a value to ASCII for the header of a PLY file, without accents and with escaped characters."""
+    """Convert a value to ASCII for the header of a PLY file: remove accents and escape all other characters."""
     text = " ".join(f"{number:.9g}" for number in value) if isinstance(value, list) else str(value)
     decomposed = unicodedata.normalize("NFKD", text.replace("©", "(c)"))
     plain = "".join(character for character in decomposed if not unicodedata.combining(character))
@@ -187,11 +190,14 @@ def _ascii(value: Any) -> str:
 
 
 def rewrite_splats(path: Path, ply: Path, placement: Placement, mask: Tensor, lines: list[str]) -> None:
-    """Write a PLY of Gaussians with a placement.
+    """Transform a PLY file of Gaussians by a placement, keep only masked Gaussians, and add comments.
 
     Args:
-        path: the file to write. ply: file from ``write_run_ply``. placement: placement of the file.
-        mask: [N] bool, the Gaussians to keep. lines: comments.
+        path: the file to write.
+        ply: file from ``write_run_ply``.
+        placement: placement of the file.
+        mask: [N] bool, the Gaussians to keep.
+        lines: comments.
     """
     element = PlyData.read(ply)["vertex"]
     table = element.data[mask.numpy()]
@@ -203,7 +209,7 @@ def rewrite_splats(path: Path, ply: Path, placement: Placement, mask: Tensor, li
 
 IMAGES = "images"
 SUFFIX = ".png"
-"""Suffix of the exported images."""
+"""File name suffix of the exported images."""
 # nerfstudio uses OpenGL axes: the camera looks along -z, and y is up.
 _OPENGL = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
 
@@ -216,10 +222,13 @@ def write_colmap(
     *,
     comments: Sequence[str] = (),
 ) -> None:
-    """Write a COLMAP model as text: one camera and one image per view, and points without tracks.
+    """Write a COLMAP model as text, with one camera and one image per view, and points without tracks.
 
     Args:
-        folder: the folder to write. cameras: cameras by view. points: [M, 3]. colors: [M, 3] uint8.
+        folder: the folder to write.
+        cameras: cameras by view.
+        points: [M, 3].
+        colors: [M, 3] uint8.
         comments: lines for the header of each file.
     """
     model = pycolmap.Reconstruction()
@@ -243,7 +252,7 @@ def write_colmap(
 
 
 def _require_complete(folder: Path, images: int, points: int) -> None:
-    """Read a model back, because pycolmap does not report a full disk.
+    """Check a written model by reading it, because pycolmap does not report a full disk.
 
     Raises:
         OSError: the model is incomplete.
@@ -283,7 +292,9 @@ def write_transforms(path: Path, cameras: Mapping[str, Camera], about: Mapping[s
     """Write ``transforms.json``.
 
     Args:
-        path: the file. cameras: cameras by view. about: additional fields, which readers ignore.
+        path: the file.
+        cameras: cameras by view.
+        about: additional fields, which other programs ignore.
     """
     write_text(path, json.dumps({**transforms(cameras), **about}, indent=1) + "\n")
 
@@ -293,13 +304,15 @@ ALL = Subject(None, "everything")
 
 
 class Presented:
-    """Presentation of a run: the Gaussians of its subject, their placement, and the provenance of files.
+    """Gaussians of a run's subject, with the placement and the provenance of the exported files.
 
-    If the scene is missing, the up axis and the subject are unknown. Then all Gaussians are exported in the
-    scene's own axes, with a warning.
+    If the scene is missing, the up axis and the subject are unknown. Then all Gaussians are exported in the axes of the
+    scene, with a warning.
 
     Args:
-        run: the run. axes: axes of the placement. masked: see ``subject_of``.
+        run: the run.
+        axes: axes of the placement.
+        masked: see ``subject_of``.
         reporter: receives a line about removed Gaussians.
 
     Raises:
@@ -348,7 +361,7 @@ class Presented:
         return None
 
     def _members(self, run: OpenedRun, reporter: Reporter) -> Tensor:
-        """Return the Gaussians that belong to the subject, [N] bool."""
+        """Return a mask [N] of the Gaussians that belong to the subject."""
         inside = self.subject.holds(run.model.state.gaussians["means"])
         count = int(inside.sum())
         if not count:
@@ -363,7 +376,7 @@ class Presented:
 
     @property
     def centers(self) -> Tensor | None:
-        """Centers of the scene's cameras [M, 3] for the orientation of surfaces; None if unknown."""
+        """Camera centers [M, 3] of the scene, which orient surfaces outward; None if they are unknown."""
         return None if self.poses is None else torch.stack([camera.center for camera in self.poses])
 
     def upright(self, run: OpenedRun) -> Placement:
@@ -377,7 +390,7 @@ class Presented:
         return comments(self.origin, self.placement)
 
     def surface_view(self, run: OpenedRun) -> Callable[[Camera], RenderResult]:
-        """Return a function that renders the Gaussians of the subject with the surface at the median depth."""
+        """Return a function that renders the subject's Gaussians, with the surface at each pixel's median depth."""
         model = run.model
 
         @torch.no_grad()

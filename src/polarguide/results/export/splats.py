@@ -1,4 +1,4 @@
-"""Export of splats from the PLY of a run: Niantic's SPZ, PlayCanvas' SOG, and glTF.
+"""Conversion of a PLY file of Gaussians to other formats of splats: Niantic's SPZ, PlayCanvas' SOG, and glTF.
 
 SOG is a ZIP file of pictures. Its specification, version 2, is at
 https://developer.playcanvas.com/user-manual/gaussian-splatting/formats/sog
@@ -7,8 +7,8 @@ We write SOG ourselves, because GaussForge 0.6 writes 65,000 Gaussians in eight 
 88,623 in six minutes.
 
 glTF uses the extension ``KHR_gaussian_splatting`` (kernel ``ellipse``). It stores linear scales, opacities in [0, 1],
-quaternions (x, y, z, w) and the harmonics of 3DGS. Its ``colorSpace`` states the encoding of colors, but readers ignore
-it. So there is one file for each kind of reader.
+quaternions (x, y, z, w) and the harmonics of 3DGS. Its ``colorSpace`` states the encoding of colors, but programs
+ignore it. So one file is written for programs that blend linear colors, and one for programs that blend encoded colors.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ SPZ_RANGE = 2047.0
 
 
 def write_spz(path: Path, ply: Path, version: int = 3) -> None:
-    """Convert a PLY of Gaussians to SPZ without our own fields.
+    """Convert a PLY file of Gaussians to SPZ, without the fields that only this program uses.
 
     Gaussians outside the range of SPZ are left out with a warning.
 
@@ -50,7 +50,7 @@ def write_spz(path: Path, ply: Path, version: int = 3) -> None:
     Args:
         path: file to write.
         ply: file from ``write_run_ply`` in the axes of SPZ.
-        version: 3, or 4 (zstd instead of gzip).
+        version: version of the format: 3 (gzip) or 4 (zstd).
 
     Raises:
         PolarguideError: the converter is not installed or cannot convert the file.
@@ -92,14 +92,16 @@ Pixels = NDArray[np.uint8]
 
 
 def write_sog(path: Path, ply: Path, asset: Mapping[str, Any] = {}) -> None:
-    """Convert a PLY of Gaussians to SOG without our own fields. The result is deterministic.
+    """Convert a PLY file of Gaussians to SOG, without the fields that only this program uses.
 
-    Positions have 16 bits of their signed logarithm, rotations 8 bits per component, other values a code of
-    256 values. Harmonics of degree 1 to 3 are entries of a palette of at most 8,192.
+    The signed logarithm of a position has 16 bits. A component of a rotation has 8 bits. Other values are indices into
+    a codebook of 256 values. Harmonics of degrees 1 to 3 are indices into a palette of at most 8,192 entries. Equal
+    input gives an equal file.
 
     Args:
-        path: the file to write. ply: file from ``write_run_ply``. asset: fields of the asset in
-            ``meta.json``.
+        path: the file to write.
+        ply: file from ``write_run_ply``.
+        asset: fields of the asset in ``meta.json``.
     """
     gaussians = {name: values for name, values in read_ply(ply).items() if name != "extra"}
     order = _morton_order(gaussians["means"])
@@ -121,7 +123,7 @@ def write_sog(path: Path, ply: Path, asset: Mapping[str, Any] = {}) -> None:
 
 
 def _store(file: zipfile.ZipFile, name: str, data: bytes) -> None:
-    """Store a file without a time stamp, so that equal splats give equal files."""
+    """Add a file to the archive without a time stamp, so that equal splats give equal archives."""
     file.writestr(zipfile.ZipInfo(name), data)
 
 
@@ -133,7 +135,7 @@ def _lossless(pixels: Pixels) -> bytes:
 
 
 def _picture(values: Tensor, width: int) -> Pixels:
-    """Arrange rows [N, 3 or 4] of bytes as a picture [H, width, 4], opaque by default."""
+    """Arrange N colors, [N, 3 or 4] bytes, as a picture [H, width, 4]. Colors without an alpha become opaque."""
     count, channels = values.shape
     pixels = np.zeros((math.ceil(count / width) * width, 4), dtype=np.uint8)
     pixels[:, 3] = 255
@@ -142,7 +144,7 @@ def _picture(values: Tensor, width: int) -> Pixels:
 
 
 def _bytes(values: Tensor) -> Tensor:
-    """Quantize [0, 1] to [0, 255]."""
+    """Quantize values in [0, 1] to bytes."""
     return (values.clamp(0, 1) * 255).round().to(torch.uint8)
 
 
@@ -160,7 +162,7 @@ def _means(means: Tensor, width: int, pictures: dict[str, Pixels]) -> dict[str, 
 def _smallest_three(quaternions: Tensor) -> Tensor:
     """Encode quaternions [N, 4] (w, x, y, z) as the three smallest components and the index of the largest.
 
-    The largest component is made positive.
+    The sign of the quaternion is chosen so that its largest component is positive.
     """
     unit = torch.nn.functional.normalize(quaternions.double(), dim=1)
     largest = unit.abs().argmax(dim=1, keepdim=True)
@@ -183,7 +185,8 @@ def _codebook(values: Tensor) -> tuple[Tensor, Tensor]:
     """Quantize values to 256 levels with Lloyd's algorithm.
 
     Returns:
-        The codes, with the shape of the values, and the ascending levels.
+        Two tensors: the index of the level of each value, in the shape of the values, and the levels in ascending
+        order.
     """
     flat = values.double().flatten()
     ranks = (torch.arange(CODES, dtype=torch.float64) + 0.5) / CODES * len(flat)
@@ -219,7 +222,7 @@ def _harmonics(rest: Tensor, width: int, pictures: dict[str, Pixels]) -> dict[st
 
 
 def _clusters(points: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """Cluster points [N, D] with Lloyd's algorithm, and return the cluster [N] int64 of each point and the means."""
+    """Cluster points [N, D] with Lloyd's algorithm. Return each point's cluster index [N] and the cluster means."""
     generator = torch.Generator().manual_seed(SEED)
     means = points[torch.randperm(len(points), generator=generator)[:count]].clone()
     for _ in range(ROUNDS):
@@ -236,7 +239,7 @@ def _nearest(points: Tensor, means: Tensor) -> Tensor:
 
 
 def _morton_order(means: Tensor) -> Tensor:
-    """Return the indices of points in Morton order. Neighbors in space then compress well."""
+    """Return the indices that sort points in Morton order. Neighbors in space then lie together and compress well."""
     # Ranks instead of positions: distant Gaussians would compress all others into one cell.
     ranks = means.argsort(dim=0).argsort(dim=0)
     return curve_places((ranks * 1024) // max(1, len(means))).argsort(stable=True)
@@ -252,10 +255,12 @@ Babylon and PlayCanvas blend encoded colors; three.js blends linear colors.
 
 
 def write_splat_glb(path: Path, ply: Path, asset: dict[str, Any], encoding: Encoding) -> None:
-    """Convert a PLY of Gaussians (+y up) without our own fields.
+    """Convert a PLY file of Gaussians (+y up) to GLB, without the fields that only this program uses.
 
     Args:
-        path: the file to write. ply: file from ``write_run_ply``. asset: glTF asset record.
+        path: the file to write.
+        ply: file from ``write_run_ply``.
+        asset: glTF asset record.
         encoding: encoding of the colors in the PLY.
 
     Raises:

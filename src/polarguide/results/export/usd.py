@@ -24,7 +24,9 @@ def write_usdz(path: Path, model: Textured, about: dict[str, Any], *, jpeg: bool
     """Write a textured mesh with a UsdPreviewSurface. An unlit mesh emits its color.
 
     Args:
-        path: the file. model: the mesh, +y up. about: custom data of the stage.
+        path: the file.
+        model: the mesh, +y up.
+        about: custom data of the stage.
         jpeg: encode base color, roughness and metalness as JPEG instead of PNG.
 
     Raises:
@@ -98,10 +100,12 @@ def _bind(stage: Any, mesh: Any, model: Textured, folder: Path, *, jpeg: bool) -
 
 
 def write_splat_usdz(path: Path, ply: Path, about: dict[str, Any]) -> None:
-    """Write splats as a ``ParticleField3DGaussianSplat`` without our own fields.
+    """Write splats as a ``ParticleField3DGaussianSplat``, without the fields that only this program uses.
 
     Args:
-        path: the file. ply: file from ``write_run_ply``, +y up. about: custom data of the stage.
+        path: the file.
+        ply: file from ``write_run_ply``, +y up.
+        about: custom data of the stage.
 
     Raises:
         PolarguideError: usd-core is missing or does not support splats, or the file cannot be written.
@@ -147,7 +151,10 @@ def _module(name: str) -> Any:
 
 
 def _package(path: Path, about: dict[str, Any], fill: Callable[[Any, Path], None]) -> None:
-    """Write a stage as a package. The function ``fill`` adds its content and may write textures into the folder."""
+    """Write a USD stage as a package.
+
+    The function ``fill`` adds content to the stage. It may write textures into the folder that it receives.
+    """
     usd, geom, utils, sdf = (_module(name) for name in ("Usd", "UsdGeom", "UsdUtils", "Sdf"))
     with temporary_folder(path.with_suffix(".parts")) as folder:
         stage = usd.Stage.CreateNew(str(folder / "model.usdc"))

@@ -1,4 +1,4 @@
-"""Export of a run as one HTML file: Gaussians, learned light, and a program that shades each pixel."""
+"""Export of a run as one HTML file with its Gaussians, its learned light, and a program that shades each pixel."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ PACKAGE = "polarguide.results.export"
 
 TEXEL = 16
 LOWEST_LOGARITHM = -80.0
-"""Logarithm of an unknown footprint. The square of the footprint is 0 in float32."""
+"""Logarithm that is stored for an unknown footprint. The square of such a footprint is 0 in float32."""
 HARMONICS = ("harmonics", "own_harmonics")
 SLOTS = {
     "mean": (0, "3<f4"),
@@ -66,7 +66,7 @@ SLOTS = {
     "own_harmonics": (112, "45i1"),
     "metal": (160, "3<f2"),
 }
-"""First byte and NumPy type of each value of a record.
+"""First byte and NumPy type of each value in the record of a Gaussian.
 
 A record consists of texels of 16 bytes, the size of a texel on the graphics card. A shading model selects its
 values, and the record ends after the last of them. All numbers are little-endian. ``f16`` is a half float.
@@ -90,16 +90,16 @@ harmonics: the largest of the 45 values is 127 steps.
 def records(
     gaussians: Parameters, values: Mapping[str, Tensor], footprints: Tensor | None = None
 ) -> NDArray[Any]:
-    """Quantize the Gaussians for the page, without those that are too faint for rendering.
+    """Quantize the Gaussians for the page. Gaussians that are too faint to be rendered are left out.
 
     Args:
         gaussians: parameters of the Gaussians.
         values: parameters of the shading model, [N, ...], by the names of ``SLOTS``.
-        footprints: [N] size of a training pixel at each Gaussian, see ``raster.magnification``; None if
-            unknown.
+        footprints: [N] size of a training pixel at each Gaussian, see ``raster.magnification``, or None if unknown.
 
     Returns:
-        [K] structured records, each padded to whole texels, in Morton order, so that neighbors are similar.
+        [K] structured records, each padded to whole texels. They are in Morton order, so that neighboring records are
+        similar.
     """
     opacity = torch.sigmoid(gaussians["opacity_logits"])
     indices = (opacity >= MINIMUM_ALPHA).nonzero()[:, 0]
@@ -127,7 +127,7 @@ def records(
 
 
 def record_type(names: Sequence[str]) -> np.dtype[Any]:
-    """Return the type of a record with some of ``SLOTS``, padded to whole texels."""
+    """Return the NumPy type of a record with the named values of ``SLOTS``, padded to whole texels."""
     offsets, formats = zip(*(SLOTS[name] for name in names), strict=True)
     end = max(at + np.dtype(form).itemsize for at, form in zip(offsets, formats, strict=True))
     size = -(-end // TEXEL) * TEXEL
@@ -135,19 +135,22 @@ def record_type(names: Sequence[str]) -> np.dtype[Any]:
 
 
 def _quantized(values: Tensor, kind: np.dtype[Any]) -> NDArray[Any]:
-    """Convert values in [0, 1] or [-1, 1] to integers up to the type's maximum; clamp floats to the type's range."""
+    """Convert values in [0, 1] or [-1, 1] to integers of a type. Values for a floating-point type are only clamped."""
     if kind.kind == "f":
         return values.clamp(-6e4, 6e4).numpy() if kind.itemsize == 2 else values.numpy()
     return np.rint(values.numpy().astype(np.float64) * np.iinfo(kind).max)
 
 
 def planes(data: NDArray[Any]) -> bytes:
-    """Transpose records to byte planes. Neighboring records are similar, so that the planes compress well."""
+    """Transpose records to byte planes: the first byte of each record, then the second byte of each record, and so on.
+
+    Neighboring records are similar, so byte planes compress well.
+    """
     return np.ascontiguousarray(data.view(np.uint8).reshape(len(data), data.itemsize).T).tobytes()
 
 
 def harmonics_steps(rest: Tensor) -> tuple[NDArray[np.int8], NDArray[np.float16]]:
-    """Quantize harmonics [N, 15, 3] to signed bytes [N, 45] (coefficient by coefficient, RGB) with steps [N]."""
+    """Quantize harmonics [N, 15, 3] to signed bytes [N, 45] with a step size [N] for each Gaussian."""
     flat = rest.flatten(1).numpy()
     step = (np.abs(flat).max(axis=1, initial=0.0) / 127).astype("<f2")
     step = np.maximum(step, np.float16(6e-8))
@@ -156,7 +159,10 @@ def harmonics_steps(rest: Tensor) -> tuple[NDArray[np.int8], NDArray[np.float16]
 
 
 def _axes(gaussians: Parameters, mask: Tensor) -> tuple[Tensor, Tensor]:
-    """Return normal axes [K, 3], and 1 [K] for an outward axis or 0 if only the camera decides."""
+    """Return the normal axes [K, 3] and their sides [K].
+
+    The side is 1 if the axis points outward. It is 0 if the position of the camera determines the direction.
+    """
     means = gaussians["means"][mask]
     origin = torch.zeros(3)
     axes = shortest_axis_normals(means, gaussians["quaternions"][mask], gaussians["log_scales"][mask], origin)
@@ -168,7 +174,7 @@ def _axes(gaussians: Parameters, mask: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _sides(side: Tensor, footprints: Tensor | None) -> NDArray[np.uint16]:
-    """Encode footprints [K] and sides [K]. An unknown footprint is 0."""
+    """Encode footprints [K] and sides [K] in 16 bits. An unknown footprint is decoded as 0."""
     lowest = torch.full_like(side, LOWEST_LOGARITHM)
     logarithms = lowest if footprints is None else footprints.log().clamp(min=LOWEST_LOGARITHM)
     bits = logarithms.numpy().astype("<f2").view("<u2")
@@ -176,7 +182,7 @@ def _sides(side: Tensor, footprints: Tensor | None) -> NDArray[np.uint16]:
 
 
 def curve_order(means: NDArray[np.float32]) -> NDArray[np.int64]:
-    """Return the order [N] of points [N, 3] along a Z curve (Morton 1966) with 1,024 cells per axis."""
+    """Return the indices [N] that sort points [N, 3] along a Z curve (Morton 1966) with 1,024 cells per axis."""
     if not len(means):
         return np.zeros(0, dtype=np.int64)
     low = np.quantile(means, 0.01, axis=0)
@@ -215,11 +221,11 @@ SHADERS = {
     "shade": "shade.frag",
 }
 LAYERS = ("final", "diffuse", "specular", "base", "strength", "normal", "metalness", "roughness")
-"""Layers of the page in the order of its buttons."""
+"""Layers that the page can show, in the order of its buttons."""
 
 
 class LayerTexts(NamedTuple):
-    """Texts of a layer on the page: label of its button, description, and meaning of both ends of its colors."""
+    """Texts of a layer on the page: button label, description, and meaning of the darkest and the brightest color."""
 
     label: str
     sentence: str
@@ -237,7 +243,7 @@ WORDS = {
     "metalness": LayerTexts("metal", "the share of metal", "no", "yes"),
     "roughness": LayerTexts("roughness", "the blur of mirror images", "mirror", "matte"),
 }
-"""Texts by the name of the layer, for readers without prior knowledge."""
+"""Texts of each layer, which explain it without technical terms."""
 _SHOWN_WITH = {"metalness": {"metal"}, "roughness": {"blur"}}
 BAKED = (
     "This page has no shaders for the reflections of this model. Each Gaussian shows its color toward the eye, with "
@@ -260,18 +266,20 @@ def share_page(
     footprints: Tensor | None = None,
     gloss: float = 1.0,
 ) -> str:
-    """Return the page.
+    """Return the web page of a run as HTML.
 
     Args:
         gaussians: the Gaussians.
-        light: parameters of the learned light by name. shading: shading model with the run's refractive
-            index.
-        cameras: poses by name, at least one. first: name of the initial pose.
+        light: parameters of the learned light by name.
+        shading: shading model with the refractive index of the run.
+        cameras: poses by name, at least one.
+        first: name of the initial pose.
         title, caption: any text; the page escapes it.
-        metrics: labels and values, any text. notes: paragraphs before the metrics, any text.
+        metrics: labels and values, any text.
+        notes: paragraphs before the metrics, any text.
         presentation: color, up axis, scale and credit.
-        footprints: [N] footprints of the training, see ``raster.magnification``; None if unknown.
-        gloss: factor on the brightness of the separate specular layer.
+        footprints: [N] size of a training pixel at each Gaussian, see ``raster.magnification``, or None if unknown.
+        gloss: factor on the brightness of the specular layer when the page shows it alone.
 
     Returns:
         Self-contained HTML. Its content policy forbids external requests.
@@ -334,7 +342,7 @@ def share_page(
 
 
 def baked_page(gaussians: Parameters, light: Light, shading: ShadingModel) -> PageShading:
-    """Return the page of a model without shaders: linear harmonics of the Gaussians' own colors, and a note."""
+    """Return the data of a page for a model without shaders: linear harmonics of baked colors, and a note."""
     dc, rest = baked_harmonics(gaussians, light, shading, present=lambda colors: colors, linear=True)
     return PageShading("plain", {"color": dc[:, 0], "harmonics": rest}, notes=[BAKED])
 
@@ -360,7 +368,7 @@ def _packed(raw: bytes) -> str:
 
 @torch.no_grad()
 def light_numbers(levels: Sequence[Tensor]) -> NDArray[np.float16]:
-    """Concatenate cubemaps [6, R, R, C] with their rings, with channels padded to a multiple of four."""
+    """Add a border to cubemaps [6, R, R, C], pad their channels to a multiple of four, and concatenate them."""
     numbers = []
     for texture in levels:
         texels = ringed_texels(texture.detach().clamp(-6e4, 6e4))
@@ -370,7 +378,7 @@ def light_numbers(levels: Sequence[Tensor]) -> NDArray[np.float16]:
 
 @torch.no_grad()
 def network_numbers(matrices: Sequence[Tensor]) -> NDArray[np.float32]:
-    """Concatenate matrices [rows, columns], with columns padded to a multiple of four."""
+    """Pad the columns of matrices [rows, columns] to a multiple of four, and concatenate the matrices."""
     padded = [pad(matrix.detach(), (0, -matrix.shape[1] % 4)).flatten() for matrix in matrices]
     return torch.cat(padded).numpy().astype("<f4")
 
@@ -395,15 +403,15 @@ def share(
         run: the run; its scene is read.
         path: file to write, ending in .html; default: ``share.html`` in the run's folder.
         title: heading of the page; default: the title of the presentation or the scene's name.
-        caption: text below the heading; default: the recipe and its steps. The kind of polarization is
-            appended.
+        caption: text below the heading; default: the recipe and its number of steps. The page appends the kind of
+            polarization.
         reporter: receives a line about removed Gaussians.
 
     Returns:
         The path of the file.
 
     Raises:
-        PolarguideError: the name has another suffix, or the scores cannot be read.
+        PolarguideError: the name does not end in .html, or the scores cannot be read.
     """
     path = run.folder / "share.html" if path is None else Path(path)
     if path.suffix.lower() not in (".html", ".htm"):
@@ -441,7 +449,10 @@ def share(
 
 
 def _best_view(views: Sequence[View], record: Mapping[str, Any] | None, health: Health | None) -> View:
-    """Return the view with the highest PSNR in the scores or the training's health check, else the first view."""
+    """Return the view with the highest PSNR in the scores or in the health check of the training.
+
+    Return the first view if there is no PSNR.
+    """
     psnr: dict[str, float | None] = {}
     if record is not None:
         psnr = {name: scores["psnr"] for name, scores in record["views"].items()}
@@ -451,11 +462,11 @@ def _best_view(views: Sequence[View], record: Mapping[str, Any] | None, health: 
 
 
 MOST_GLOSS = 16.0
-"""Maximum brightening of the specular layer. More would show the noise of dark surfaces."""
+"""Largest factor on the brightness of the specular layer. A larger factor would show the noise of dark surfaces."""
 
 
 def _gloss(result: RenderResult) -> float:
-    """Return the factor, a power of two, that brightens the specular layer so that at most 1 % of it clips."""
+    """Return the largest power of two by which the specular layer can be multiplied so that at most 1 % of it clips."""
     if "specular" not in result.layers:
         return 1.0
     brightest = result.layers["specular"].amax(dim=-1)[result.alpha > 0.5].flatten()

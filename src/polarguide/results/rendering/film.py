@@ -1,4 +1,4 @@
-"""Rendering of a run along a camera path, as a video (MP4, H.264) or as pictures."""
+"""Rendering of a run along a camera path, as a video (MP4, H.264) or as PNG files."""
 
 from __future__ import annotations
 
@@ -27,7 +27,10 @@ from polarguide.visualization.figures import Picture, layer_picture
 
 
 def write_video(path: Path, pictures: Iterable[Picture], *, frames_per_second: float) -> int:
-    """Write uint8 RGB pictures [H, W, 3] of one size as a video. Odd sides lose their last row or column for H.264.
+    """Write uint8 RGB pictures [H, W, 3] of one size as a video.
+
+    H.264 needs an even width and height. So the last column of an odd width and the last row of an odd height are cut
+    off.
 
     Returns:
         The number of written pictures.
@@ -76,10 +79,10 @@ def write_video(path: Path, pictures: Iterable[Picture], *, frames_per_second: f
 
 
 def _require_complete(encoder: Any, path: Path, count: int) -> None:
-    """Check the number of frames of a video. The encoder is another program, and does not report a full disk.
+    """Check the number of frames of a written video, because the encoder does not report a full disk.
 
     Raises:
-        OSError: frames are missing.
+        OSError: the file has fewer frames than were written.
     """
     try:
         frames, _ = encoder.count_frames_and_secs(path)
@@ -90,12 +93,12 @@ def _require_complete(encoder: Any, path: Path, count: int) -> None:
 
 
 SWINGS = {"orbit": 0.0, "spiral": 0.25}
-"""Vertical amplitude of paths around the scene, in units of the cameras' distance."""
+"""Vertical amplitude of each path around the scene, as a share of the cameras' distance from its center."""
 FILLED = 0.9
-"""Share of the subject's Gaussians, nearest to its center, that every picture of a turntable contains."""
+"""Share of the subject's Gaussians that every picture of a turntable contains. The outermost ones may be cut off."""
 FRAMES_PER_SECOND = 30.0
 RENDERED = 160
-"""Least number of bytes per pixel during rendering."""
+"""Lower bound of the memory of a rendering, in bytes per pixel."""
 
 
 def path_cameras(
@@ -107,11 +110,13 @@ def path_cameras(
         run: the run whose cameras define the path.
         path: ``orbit``, ``turntable`` (around the subject, which fills the picture), ``spiral``,
             ``interpolate``, or a JSON file of cameras.
-        frames: number of cameras, except of a file.
-        size: width and height of the pictures, except of a file; None: those of the photographs.
+        frames: number of cameras; ignored for a file of cameras.
+        size: width and height of the pictures. None takes the size of the photographs. A file of cameras has its own
+            size.
 
     Raises:
-        PolarguideError: too many frames, a size for a file, or a file that cannot be read.
+        PolarguideError: there are too many frames, a size is specified together with a file, or the file cannot be
+            read.
     """
     check_finite("frames", frames, 1, 100_000)
     cameras = list(run.cameras.values())
@@ -163,7 +168,7 @@ def write_film(
         run: the run; its scene is read.
         out: MP4 file to write, or a folder for PNG files.
         path, frames: see ``path_cameras``.
-        size: width and height of the film, all layers together; None: each layer has the photographs' size.
+        size: width and height of the film with all layers; None shows each layer in the size of the photographs.
         layers: names of layers.
         reporter: receives the progress.
 
@@ -211,7 +216,7 @@ def write_film(
 def _pictures(
     run: OpenedRun, layers: list[str], cameras: list[Camera], reporter: Reporter, *, named: bool
 ) -> Iterator[Picture]:
-    """Yield a picture of the layers side by side for each camera, with their names if requested."""
+    """Yield one picture per camera, which shows the layers side by side; ``named`` adds their names."""
     within = part_shown(run, reporter)
     depths = rendered_depths(run, cameras, within) if "depth" in layers else None
     color = run.presentation.color

@@ -26,11 +26,11 @@ TRUNCATION = 4.0
 """Truncation of the distance field, in voxels."""
 _BATCH = 1 << 21  # voxels
 _BOX_POINTS = 1 << 20
-"""Approximate number of points of all views for the bounding box, which limits the memory."""
+"""Approximate number of points, over all views, from which the bounding box is computed. It limits the memory."""
 
 
 class NoSurfaceError(PolarguideError):
-    """Error for a scene without a surface that several views see."""
+    """Error for a scene in which no surface is visible in several views."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +38,9 @@ class Box:
     """Grid of voxels.
 
     Attributes:
-        low: [3] corner. size: side of a voxel. counts: number of voxels per axis.
+        low: [3] corner.
+        size: side of a voxel.
+        counts: number of voxels per axis.
     """
 
     low: Tensor
@@ -48,27 +50,29 @@ class Box:
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """A triangle mesh: vertices [V, 3] float64 in the world, faces [F, 3], normals [V, 3] outward, unit."""
+    """Triangle mesh: vertices [V, 3] (float64, world), faces [F, 3] and outward unit normals [V, 3]."""
 
     vertices: NDArray[np.float64]
     faces: NDArray[np.int64]
     normals: NDArray[np.float64]
 
     def with_faces(self, faces: NDArray[np.int64]) -> tuple[Surface, NDArray[np.int64]]:
-        """Return the surface of some of the faces, and the indices of its vertices, [K]."""
+        """Return the surface that consists of ``faces``, and the indices [K] of its vertices in this surface."""
         used, numbers = np.unique(faces, return_inverse=True)
         return Surface(self.vertices[used], numbers.reshape(faces.shape), self.normals[used]), used
 
 
 def seen_points(camera: Camera, depth: Tensor, mask: Tensor) -> Tensor:
-    """Return the world points [M, 3] float64 of the pixels in ``mask`` [H, W] at camera depths [H, W]."""
+    """Convert the depths [H, W] of the pixels in ``mask`` [H, W] to world points [M, 3] float64."""
     rays = camera.rays()[mask].double()
     local = rays * (depth[mask].double() / rays[:, 2])[:, None]
     return camera.to_world(local) + camera.center
 
 
 def box_around(points: Sequence[Tensor], center: Tensor, reach: float, resolution: int) -> Box:
-    """Return the box of points [M, 3] within ``reach`` of the center, without the outermost 0.5 %.
+    """Return a grid around the points that are nearer to the center than ``reach``.
+
+    The outermost 0.5 % of the points are ignored as outliers.
 
     Raises:
         PolarguideError: there are too few points.
@@ -93,11 +97,12 @@ def fuse(box: Box, views: Iterable[tuple[Camera, Tensor, Tensor]]) -> tuple[Tens
 
     Args:
         box: the grid.
-        views: camera, camera depth [H, W], and valid pixels [H, W] bool.
+        views: camera, camera depth [H, W] and mask of valid pixels [H, W] of each view.
 
     Returns:
-        The mean distance relative to the truncation, in [-1, 1], positive in front of the surface; and the
-        number of views of each voxel. Both have the grid's shape, float32.
+        Two float32 tensors of the shape of the grid. The first is the mean signed distance, divided by the truncation.
+        It is in [-1, 1] and positive in front of the surface. The second is the number of views that contain each
+        voxel.
     """
     total = torch.zeros(box.counts)
     weight = torch.zeros(box.counts)
@@ -132,13 +137,13 @@ def fuse(box: Box, views: Iterable[tuple[Camera, Tensor, Tensor]]) -> tuple[Tens
 
 
 LEAST_VIEWS = 2
-"""Minimum number of views of a voxel."""
+"""Minimum number of views that must contain a voxel of the surface."""
 SMALLEST_PIECE = 0.01
-"""Share of the largest piece's faces below which pieces are dropped."""
+"""Minimum number of faces of a connected piece, relative to the largest piece. Smaller pieces are removed."""
 
 
 def zero_surface(box: Box, field: Tensor, weight: Tensor) -> Surface:
-    """Return the zero set of a distance field, without small loose pieces (marching cubes, Lewiner et al. 2003).
+    """Extract the surface of a distance field by marching cubes (Lewiner et al. 2003), and remove small pieces.
 
     Args:
         box: the grid.
@@ -165,12 +170,12 @@ def zero_surface(box: Box, field: Tensor, weight: Tensor) -> Surface:
 
 
 def largest_pieces(surface: Surface, smallest: float) -> Surface:
-    """Return the connected pieces that have at least a share of the largest piece's faces."""
+    """Remove connected pieces with fewer faces than ``smallest`` times the faces of the largest piece."""
     return surface.with_faces(large_faces(surface, smallest))[0]
 
 
 def large_faces(surface: Surface, smallest: float) -> NDArray[np.int64]:
-    """Return the faces [F, 3] of these pieces."""
+    """Return the faces [F, 3] that ``largest_pieces`` keeps."""
     piece = face_pieces(surface.faces)
     sizes = np.bincount(piece)
     return surface.faces[sizes[piece] >= smallest * sizes.max()]
@@ -187,9 +192,9 @@ def face_pieces(faces: NDArray[np.int64]) -> NDArray[np.int32]:
 RESOLUTION = 192
 """Default number of voxels along the longest side."""
 OPAQUE = 0.8
-"""Minimum alpha of pixels with a valid depth."""
+"""Minimum alpha of a pixel whose depth is used."""
 COARSE = 64
-"""Number of voxels along the sides of the box in which a field's surface is searched."""
+"""Number of voxels along each side of the coarse grid in which the surface of a field is searched."""
 # Least cosine of the viewing angle of pixels with a valid depth.
 _STEEPEST = 0.1
 
@@ -202,7 +207,9 @@ class ColoredMesh:
     colors: NDArray[np.float64]
 
     def within(self, vertices: NDArray[np.bool_]) -> ColoredMesh:
-        """Return the faces whose vertices are all in a mask [V] bool, without the small pieces of the cut.
+        """Return the part of the mesh inside a mask of vertices [V], without small pieces.
+
+        A face is kept if the mask contains all of its vertices.
 
         Raises:
             PolarguideError: no face is left.
@@ -221,11 +228,11 @@ class ColoredMesh:
 def scene_mesh(
     cameras: Mapping[str, Camera], render: Callable[[Camera], RenderResult], *, resolution: int
 ) -> ColoredMesh:
-    """Return the colored mesh of a scene, fused from depth maps of its cameras.
+    """Fuse depth maps of all cameras to a mesh with colors.
 
     Args:
         cameras: at least two cameras.
-        render: renders a camera's depth and normals.
+        render: renders depth and normals for a camera.
         resolution: number of voxels along the longest side of the box that the cameras see.
 
     Raises:
@@ -239,7 +246,7 @@ def scene_mesh(
 def fused_surface(
     cameras: Mapping[str, Camera], render: Callable[[Camera], RenderResult], *, resolution: int
 ) -> tuple[Surface, list[tuple[Camera, DepthSamples]], Box]:
-    """Return the unpainted surface of ``scene_mesh``, the depth samples of each camera, and the grid."""
+    """Fuse depth maps to a surface without colors; return also the samples of each camera and the grid."""
     optional_import("skimage.measure", "a mesh")
     views = [(camera, _depth_samples(render(camera).to("cpu"), camera)) for camera in cameras.values()]
     around = scene_frame(list(cameras.values()))
@@ -254,7 +261,7 @@ def fused_surface(
 
 @dataclass(frozen=True, eq=False)
 class DepthSamples:
-    """Samples of one view: depth [H, W], valid pixels [H, W], diffuse color and world normal [H, W, 3].
+    """Rendered depth [H, W], valid pixels [H, W], diffuse color and world normal [H, W, 3] of one view.
 
     Colors and normals have half precision, since all views are in memory together.
     """
@@ -275,7 +282,10 @@ def _depth_samples(result: RenderResult, camera: Camera) -> DepthSamples:
 
 
 def painted(surface: Surface, views: list[tuple[Camera, DepthSamples]], box: Box) -> ColoredMesh:
-    """Average colors and normals over the views of each vertex, weighted by the cosine of the viewing angle."""
+    """Color a surface by the mean color and normal of each vertex over the views that see it.
+
+    The weight of a view is the cosine of its viewing angle.
+    """
     vertices = torch.from_numpy(surface.vertices)
     own = torch.from_numpy(surface.normals)
     color = torch.zeros_like(vertices)

@@ -1,4 +1,4 @@
-"""Surfaces and colors at picked places, and gains of a white balance."""
+"""Surface and color at a pixel that the user picks, and white balance from such a color."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ PATCH = 2  # radius in pixels over which a picked color is averaged
 
 @dataclass(frozen=True, eq=False)
 class SurfacePoint:
-    """A picked place of a surface.
+    """Surface point at a picked pixel.
 
     Attributes:
         point: [3] float64 in the world.
-        normal: [3] float64 unit, toward the camera; None: unknown.
-        color: [3] linear radiance of the final layer around it.
+        normal: [3] float64 unit vector toward the camera, or None if unknown.
+        color: [3] linear radiance of the final layer around the point.
     """
 
     point: Tensor
@@ -40,7 +40,9 @@ class SurfacePoint:
 
 
 def surface_at(result: RenderResult, camera: Camera, x: float, y: float) -> SurfacePoint | None:
-    """Return the surface at a place of a rendering with depth, or None outside the picture and without a surface.
+    """Return the surface at a position in a rendering with depth.
+
+    Return None if the position lies outside the picture or shows no surface.
 
     Args:
         result: the rendering, with the size of the camera.
@@ -67,10 +69,10 @@ def surface_at(result: RenderResult, camera: Camera, x: float, y: float) -> Surf
 
 
 def photograph_color(view: View, x: float, y: float) -> Tensor:
-    """Return the mean color [3] of a photograph's valid pixels around a place; see ``surface_at``.
+    """Return the mean color [3] of the valid pixels of a photograph around a position; see ``surface_at``.
 
     Raises:
-        PolarguideError: the place lies outside, or no pixel there is valid.
+        PolarguideError: the position lies outside the photograph, or no pixel around it is valid.
     """
     camera = view.camera
     if not (0 <= x < camera.width and 0 <= y < camera.height):
@@ -100,7 +102,7 @@ def _patch(picture: Tensor, row: int, column: int) -> Tensor:
 
 
 def white_balance_gains(color: Tensor) -> Vector:
-    """Return gains that make a linear color [3] gray, relative to green, like the white balance of a camera.
+    """Return the gains [3] of a white balance that makes a linear color [3] gray. The gain of green is 1.
 
     Raises:
         PolarguideError: the color is too dark, clips, or is not gray under any usual light.
@@ -126,7 +128,7 @@ def white_balance_gains(color: Tensor) -> Vector:
 
 
 def gray_world_gains(views: Iterable[View]) -> Vector:
-    """Return gains that make the photographs' mean over valid pixels gray (Buchsbaum 1980), relative to green.
+    """Return gains [3] that make the mean of all valid pixels gray (Buchsbaum 1980). The gain of green is 1.
 
     Raises:
         PolarguideError: there are no valid pixels, or all are black.

@@ -57,14 +57,14 @@ UNITS = {
     "aolp": "predicted angle of linear polarization, radians from 0 to pi, counter-clockwise from the picture's "
     "horizontal",
 }
-"""Meaning of the numbers of each layer."""
+"""Meaning and unit of the numbers in each layer's file."""
 
 
 def views_named(scene: Scene, choice: str) -> tuple[View, ...]:
-    """Return the views of a choice: ``test``, ``train``, ``all``, or names separated by commas.
+    """Return the views that an option names: ``test``, ``train``, ``all``, or names separated by commas.
 
     Raises:
-        PolarguideError: a view does not exist, or the choice is empty.
+        PolarguideError: a view does not exist, or the option names no view.
     """
     groups = {"test": scene.test_views, "train": scene.train_views, "all": scene.views}
     names = [name.strip() for name in choice.split(",") if name.strip()]
@@ -86,18 +86,17 @@ def write_pictures(
     transparent: bool = False,
     reporter: Reporter = SILENT,
 ) -> Path:
-    """Write layers of some views, one file each, and a contact sheet of them and the ground truth.
+    """Write one file per layer and view, and a contact sheet that compares the layers with the ground truth.
 
     Args:
         run: the run; its scene is read.
         out: folder to write; default: ``render`` in the run's folder.
         views: ``test``, ``train``, ``all``, or names separated by commas.
-        layers: names of layers; default: all of the run's. Layers that the recipe lacks are left out and
-            reported.
-        format: png shows layers like a display, in the color of the run's presentation. exr and npy contain
-            linear numbers in the units in ``layers.json``. The contact sheet is PNG.
-        transparent: write PNG files with a transparent background. Their colors are not blended with black,
-            so that they have no dark rim on another background. The contact sheet is opaque.
+        layers: names of layers; default: all layers of the run. A layer that the recipe lacks is skipped and reported.
+        format: png files show the layers in the colors of the run's presentation. exr and npy files contain linear
+            numbers, whose units ``layers.json`` states. The contact sheet is always a PNG file.
+        transparent: write PNG files with a transparent background. Their colors are not blended with black, which would
+            leave a dark rim on a bright background. The contact sheet is opaque.
         reporter: receives the progress.
 
     Returns:
@@ -157,7 +156,7 @@ def write_pictures(
 def _layer_pictures(
     result: RenderResult, names: Sequence[str], view: View, depths: Depths | None, color: Tensor | None
 ) -> dict[str, Picture]:
-    """Return the pictures of the layers that a rendering has, by name."""
+    """Return pictures of the named layers; layers that the rendering lacks are omitted."""
     pictures = {
         name: layer_picture(result, name, view.camera, depths, exposed=name == "reflection", color=color)
         for name in names
@@ -168,7 +167,7 @@ def _layer_pictures(
 def common_depths(run: OpenedRun, views: Sequence[View]) -> Depths:
     """Return one depth range for some views, so that their colors are comparable.
 
-    It is the range of the true depths if all views have them, else of the rendered depths of a few views.
+    If all views have true depths, the range is computed from them, otherwise from rendered depths of a few views.
     """
     true = [true_depths(view) for view in views]
     known = [depth for depth in true if depth is not None]
@@ -179,12 +178,12 @@ def common_depths(run: OpenedRun, views: Sequence[View]) -> Depths:
 
 
 def rendered_depths(run: OpenedRun, cameras: Sequence[Camera], within: Within | None = None) -> Depths:
-    """Return the range of the rendered depths of a few of the cameras.
+    """Render depth for a few of the cameras and return its range.
 
     Args:
         run: the run.
         cameras: the cameras.
-        within: part of the scene that is shown.
+        within: part of the scene that is rendered.
     """
     values = []
     for camera in cameras[:: max(1, len(cameras) // 4)]:
@@ -199,8 +198,8 @@ def _sheet(
 ) -> Picture:
     """Return a contact sheet with a row for each view, and a legend below.
 
-    Columns that some view lacks are left out. Layers of one color in all views, such as metalness without any
-    metal, are also left out, and the caption names them.
+    A column is left out if one of the views lacks it. A layer that has the same single color in all views, such as
+    metalness without any metal, is also left out, and the caption names it.
     """
     titles = [column for name in names for column in (name, true_name(name), f"{name}, measured")]
     columns = [column for column in titles if all(column in cells for _, cells in views)]
@@ -219,14 +218,14 @@ def _sheet(
 
 
 def _unblended(result: RenderResult) -> RenderResult:
-    """Return a rendering whose layers of radiance are divided by alpha."""
+    """Divide the radiance layers of a rendering by alpha."""
     alpha = result.alpha.clamp(min=1e-3)[..., None]
     names = {"final", "base", "specular", "diffuse"} & result.layers.keys()
     return result.with_layers(**{name: result.layers[name] / alpha for name in names})
 
 
 def _write_numbers(path: Path, values: Tensor) -> None:
-    """Write the linear numbers of a layer, [H, W], [H, W, 3], or Stokes vectors [3, H, W, 3], as float32."""
+    """Write a layer [H, W] or [H, W, 3], or Stokes vectors [3, H, W, 3], as linear float32 numbers."""
     numbers = values.detach().cpu().float().contiguous()
     if path.suffix == ".exr":
         numbers = numbers if numbers.ndim < 4 else luminance(numbers).movedim(0, -1).contiguous()
@@ -246,19 +245,19 @@ def write_priors(
     threshold: float = 0.05,
     reporter: Reporter = SILENT,
 ) -> Path:
-    """Write pictures of a scene's polarization, one PNG each, and a contact sheet of them.
+    """Write PNG files that show the polarization of a scene, and a contact sheet of all of them.
 
     The pictures show S0, DoLP, AoLP, zenith, both separations, polarization normals, normals from color
-    differences, and the mask of usable pixels. The exact separation needs normals: those of a trained run,
-    else the polarization normals. Without a run, their ambiguity is resolved only by the visibility of the
-    surface.
+    differences, and the mask of usable pixels. The exact separation needs normals. They come from a trained run or,
+    without a run, from polarization. In the second case, only the visibility of the surface resolves the ambiguity of
+    the normals.
 
     Args:
         scene: a scene with poses.
         out: folder to write.
         run: a run trained on this scene at this size, whose normals resolve the ambiguity.
         views: ``test``, ``train``, ``all``, or names separated by commas.
-        refractive_index: refractive index of the surfaces; None for the scene's.
+        refractive_index: refractive index of the surfaces; None takes the index of the scene.
         threshold: DoLP above which a pixel's normal is used.
         reporter: receives the progress.
 
@@ -266,8 +265,8 @@ def write_priors(
         The path of the contact sheet.
 
     Raises:
-        PolarguideError: a view does not exist, its pictures do not determine its polarization, or the run was
-            trained at another size.
+        PolarguideError: a view does not exist, the pictures of a view do not determine its polarization, or the run was
+            trained at another picture size.
     """
     check_finite("threshold", threshold, 0.0, 1.0)
     index = index_of(refractive_index, scene.refractive_index)
@@ -300,7 +299,7 @@ def write_priors(
 
 @torch.no_grad()
 def prior_pictures(view: View, run: OpenedRun | None, index: float, threshold: float) -> dict[str, Picture]:
-    """Return all pictures of one view by the name of their file."""
+    """Return all polarization pictures of one view by file name."""
     rays = view.camera.rays()
     stokes = view.stokes()
     luminance = optics.luminance(stokes)
@@ -340,7 +339,7 @@ def prior_pictures(view: View, run: OpenedRun | None, index: float, threshold: f
 def resolving_normals(
     view: View, run: OpenedRun | None, rays: Tensor, luminance: Tensor, index: float
 ) -> tuple[Tensor, str]:
-    """Return normals in camera axes that resolve the ambiguity, and the name of their source."""
+    """Return camera-space normals that resolve the ambiguity of polarization normals, and the name of their source."""
     if run is not None:
         normal = run.result(view.name, depth=False).to("cpu").normal
         return guide_normals(view.camera.to_camera(normal), rays, Priors.minimum_normal)[0], "by_run"

@@ -1,4 +1,4 @@
-"""Setting of the presentation of a scene or a run, from texts of the command line or of a program.
+"""Change of the presentation of a scene or a run: color, exposure, up axis, scale, crop box and credit.
 
 A color chart in a photograph gives a matrix from the camera's linear RGB to linear sRGB. The chart of 24 patches is
 defined by McCamy, Marcus and Davidson (1976), "A color-rendition chart". ``LAB`` are its
@@ -62,21 +62,21 @@ LAB: Floats = np.array([
     (66.89, -0.75, -0.06), (50.76, -0.13, 0.14), (35.63, -0.46, -0.48), (20.64, 0.07, -0.46),
 ])  # fmt: skip
 _ORDERS = [[(begin + step * k) % 4 for k in range(4)] for begin in range(4) for step in (1, -1)]
-"""The eight ways to go around four corners."""
+"""All eight orders in which four corners can be listed around a quadrilateral."""
 COLUMNS = 6
 ROWS = 4
 XYZ_OF_SRGB: Floats = np.array(
     [(0.4360747, 0.3850649, 0.1430804), (0.2225045, 0.7168786, 0.0606169), (0.0139322, 0.0971045, 0.7141733)]
 )
-"""Linear sRGB to XYZ under D50, adapted after Bradford (Lindbloom, "RGB/XYZ matrices")."""
+"""Matrix from linear sRGB to XYZ under D50, with Bradford adaptation (Lindbloom, "RGB/XYZ matrices")."""
 HALF_PATCH = 0.25
-"""Half width of the evaluated square of a patch, in units of the distance of two patches."""
+"""Half the side of the square that is averaged in each patch, relative to the distance between patch centers."""
 LEAST_PIXELS = 16
-"""Least number of pixels of a patch, against noise and the mosaic's colors."""
+"""Minimum number of pixels in a patch. Fewer pixels would be too noisy."""
 LEAST_PATCHES = 18
-"""Least number of patches, twice the unknowns of the matrix."""
+"""Minimum number of usable patches: twice the number of unknowns in the matrix."""
 WORST_FIT = 6.0
-"""Largest mean CIEDE2000. Cameras reach 1 to 4; a larger error means wrong corners, another chart or uneven light."""
+"""Largest accepted mean CIEDE2000. Cameras reach 1 to 4; wrong corners or uneven light give more."""
 
 
 def chart_of(view: View, corners: Sequence[float]) -> Chart:
@@ -84,10 +84,12 @@ def chart_of(view: View, corners: Sequence[float]) -> Chart:
 
     Args:
         view: view whose photograph shows the chart.
-        corners: x, y in pixels of the centers of the four corner patches, around the chart, from any of them.
+        corners: x and y in pixels of the centers of the four corner patches, listed around the chart in either
+            direction. Any corner may be the first.
 
     Raises:
-        PolarguideError: patches clip, are too small or too few, or no order of the corners fits.
+        PolarguideError: too few patches are usable because they clip or are too small, or the colors do not fit a
+            chart.
     """
     quad = np.array(corners, dtype=np.float64).reshape(4, 2)
     fits = []
@@ -117,7 +119,7 @@ def chart_of(view: View, corners: Sequence[float]) -> Chart:
 
 
 def _patches(view: View, quad: Floats) -> Floats:
-    """Return the mean linear colors of the patches, [24, 3]; NaN for clipped, invalid and too small patches."""
+    """Return the mean linear color of each patch, [24, 3]; NaN if the patch is clipped, invalid or too small."""
     ends = np.array([(0, 0), (COLUMNS - 1, 0), (COLUMNS - 1, ROWS - 1), (0, ROWS - 1)], np.float32)
     to_chart = cv2.getPerspectiveTransform(quad.astype(np.float32), ends)
     camera = view.camera
@@ -140,7 +142,7 @@ def _patches(view: View, quad: Floats) -> Floats:
 
 
 def _linear(colors: Floats, used: NDArray[np.bool_]) -> Floats:
-    """Return the least-squares matrix [3, 3] in linear sRGB, or zeros if there are too few patches."""
+    """Fit a matrix [3, 3] to the chart by least squares in linear sRGB; return zeros if there are too few patches."""
     if len(colors) < LEAST_PATCHES:
         return np.zeros((3, 3))
     wanted = _skimage().lab2xyz(LAB, illuminant="D50")[used] @ np.linalg.inv(XYZ_OF_SRGB).T
@@ -152,7 +154,7 @@ def _lab(matrix: Floats, colors: Floats) -> Floats:
 
 
 def _distance(matrix: Floats, colors: Floats, used: NDArray[np.bool_]) -> float:
-    """Return the mean CIEDE2000 of colors after a matrix."""
+    """Return the mean CIEDE2000 between the chart and the colors after multiplication by a matrix."""
     if not len(colors):
         return np.inf
     return float(_skimage().deltaE_ciede2000(LAB[used], _lab(matrix, colors)).mean())
@@ -166,7 +168,7 @@ def _fitted(colors: Floats, used: NDArray[np.bool_]) -> Floats:
 
 
 def _left_out(colors: Floats, used: NDArray[np.bool_]) -> Floats:
-    """Return the CIEDE2000 of each used patch by the matrix of the others."""
+    """Return the CIEDE2000 of each used patch, computed with a matrix that was fitted without this patch."""
     one = np.eye(len(LAB), dtype=bool)
     others = used & ~one
     return np.array(
@@ -228,10 +230,10 @@ def present(
         reporter: receives the progress of long operations.
 
     Returns:
-        The presentation of the folder: for a run, its own over its scene's.
+        The presentation of the folder. In a run, its own values override the values of the scene.
 
     Raises:
-        PolarguideError: the folder does not exist, or a value is invalid; nothing is written.
+        PolarguideError: the folder does not exist, or a value is invalid. In both cases no file is changed.
     """
     place = _PresentedFolder(Path(folder), device, reporter)
     if scene is not None:
@@ -293,25 +295,25 @@ class _PresentedFolder:
 
     @cached_property
     def scene(self) -> Scene:
-        """The scene, or the scene of the run."""
+        """The scene in this folder, or the scene on which the run in this folder was trained."""
         return self._run.scene if self._is_run else load_scene(self.folder, reporter=self._reporter)
 
     def move_scene(self, scene: PathLike) -> None:
         """Set the new folder of a run's scene.
 
         Raises:
-            PolarguideError: the folder is not a run, or the scene is another one.
+            PolarguideError: the folder is not a run, or the run was trained on a different scene.
         """
         if not self._is_run:
             raise _wrong("scene", "the folder of a run, whose scene was moved", str(self.folder))
         self._run.point_to(scene)
 
     def shown(self, own: Presentation) -> Presentation:
-        """Return the presentation that applies, given the folder's own values."""
+        """Complete the folder's own presentation ``own`` by the values that a run inherits from its scene."""
         return own.over(read_presentation(self._scene_folder)) if self._is_run else own
 
     def refuse_inherited(self, names: Sequence[str]) -> None:
-        """Refuse to remove inherited values from a run.
+        """Raise an error if a run would remove a value that its scene defines.
 
         Raises:
             PolarguideError: the scene has one of the values.
@@ -329,7 +331,7 @@ class _PresentedFolder:
                 )
 
     def pixel(self, text: str) -> tuple[str, float, float] | None:
-        """Parse VIEW,X,Y to a view and a place in it, or return None for other texts."""
+        """Parse VIEW,X,Y to the name of a view and a position in pixels; return None for other texts."""
         name, *numbers = text.rsplit(",", 2)
         places = decimals(",".join(numbers))
         if len(places) != 2 or (decimals(name) and name not in find_layout(self._scene_folder).names):
@@ -337,7 +339,7 @@ class _PresentedFolder:
         return name, places[0], places[1]
 
     def surface(self, name: str, x: float, y: float, where: str) -> tuple[Tensor, Tensor | None]:
-        """Return the point and the normal of the surface at a pixel of a view.
+        """Return the surface point and its normal at a pixel of a view.
 
         Raises:
             PolarguideError: there is no surface, or the folder is not a run.
@@ -361,7 +363,7 @@ class _PresentedFolder:
         return hit.point, hit.normal
 
     def point(self, text: str) -> Tensor:
-        """Return a PLACE as a point [3] in the world.
+        """Convert a PLACE to a world point [3].
 
         Raises:
             PolarguideError: the text is not a PLACE.
@@ -447,7 +449,7 @@ def _crop(text: str, up: Vector | None) -> dict[str, Any]:
 
 
 def _require_numbers(text: str, count: int, where: str, expected: str) -> tuple[float, ...]:
-    """Parse a fixed count of numbers separated by commas.
+    """Parse exactly ``count`` numbers separated by commas.
 
     Raises:
         PolarguideError: the text has another form.
@@ -463,7 +465,7 @@ def _wrong(where: str, expected: str, found: str) -> PolarguideError:
 
 
 def presentation_lines(presentation: Presentation) -> list[str]:
-    """Return the values that are set, a line each; "nothing is set" for an empty presentation."""
+    """Return one line per value that is set, or "nothing is set" for an empty presentation."""
     chart = presentation.chart
     exposure = presentation.exposure
     crop = presentation.crop

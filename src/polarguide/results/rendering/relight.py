@@ -31,7 +31,7 @@ from polarguide.shading.model import RadianceCubemap, ShadingModel, mirrored
 
 LARGEST = 8192 * 4096
 RELIT_RESOLUTION = 128
-"""Texels along the sides of a cubemap made from a panorama or by rotation."""
+"""Number of texels along a side of a cubemap that is resampled from a panorama or rotated."""
 
 
 def relight(
@@ -88,11 +88,11 @@ def needs_radiance(shading: ShadingModel, *, what: str) -> RadianceCubemap:
 
 @torch.no_grad()
 def mirrored_light(run: OpenedRun, cubemap: RadianceCubemap, advance: Advance) -> Tensor:
-    """Return raw texels [6, R, R, 3] of the learned light together with the local light of the Gaussians.
+    """Combine the learned environment and the local light of the Gaussians into raw texels [6, R, R, 3].
 
-    A texel is the mean of the light that all training views see reflected from its direction, weighted by the
-    square of the reflected share. This is the least-squares fit to the specular layers. The learned light
-    counts as one additional pixel of a surface with full strength at normal incidence.
+    Each texel is a weighted mean over the pixels of all training views that reflect light from its direction. The
+    weight of a pixel is the square of its reflected share, which gives the least-squares fit to the specular layers.
+    The learned environment counts as one additional pixel with full strength at normal incidence.
     """
     texels = run.light[cubemap.name].detach().cpu()
     shading = run.model.shading
@@ -118,7 +118,7 @@ def mirrored_light(run: OpenedRun, cubemap: RadianceCubemap, advance: Advance) -
 
 @torch.no_grad()
 def panorama(texels: Tensor, cubemap: RadianceCubemap, around: SceneFrame, height: int) -> Tensor:
-    """Return the radiance [H, 2 H, 3] of raw texels [6, R, R, 3]."""
+    """Convert raw texels [6, R, R, 3] of a cubemap to a panorama of radiance [H, 2 H, 3]."""
     steps = torch.arange(2 * height, dtype=torch.float64) + 0.5
     latitude = math.pi * (0.5 - steps[:height, None] / height)
     longitude = math.pi * (steps[None] / height - 1)
@@ -134,7 +134,7 @@ def panorama(texels: Tensor, cubemap: RadianceCubemap, around: SceneFrame, heigh
 def cubemap_of_panorama(
     picture: Tensor, cubemap: RadianceCubemap, around: SceneFrame, resolution: int
 ) -> Tensor:
-    """Return raw texels [6, R, R, 3] of a panorama of radiance [H, W, 3], clamped to the range of raw values."""
+    """Convert a panorama of radiance [H, W, 3] to raw texels [6, R, R, 3], clamped to the range of raw values."""
     directions = texel_directions(resolution).double() @ around.panorama_axes()
     x, y, z = directions.unbind(-1)
     across = torch.atan2(x, -z) / math.pi
@@ -151,7 +151,7 @@ def cubemap_of_panorama(
 
 @torch.no_grad()
 def turned_cubemap(texels: Tensor, turn: Tensor, resolution: int) -> Tensor:
-    """Return raw texels [6, R, R, C] of an environment rotated by [3, 3] in the world."""
+    """Rotate an environment by a rotation matrix [3, 3] in world axes, and return its raw texels [6, R, R, C]."""
     directions = (texel_directions(resolution).double() @ turn).reshape(-1, 3)
     return cubemap_lookup(texels, directions.to(texels)).reshape(6, resolution, resolution, -1)
 
@@ -191,7 +191,7 @@ def read_panorama(path: Path) -> Tensor:
     """Read a panorama of linear radiance, Radiance HDR or OpenEXR: [H, W, 3] float32, not negative.
 
     Raises:
-        PolarguideError: the file is missing, has another format or aspect ratio, has no light, or contains NaN.
+        PolarguideError: the file is missing, has another format or aspect ratio, is black, or contains NaN.
     """
     found = ""
     if not path.is_file():

@@ -1,4 +1,4 @@
-"""The subject of a run: the part of the scene that films, pages and exported files show by default."""
+"""Subject of a run: the part of the scene that films, web pages and exported files show by default."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from polarguide.runs.model import Within
 from polarguide.runs.opened import OpenedRun
 
 Inside = Callable[[NDArray[Any]], NDArray[np.bool_]]
-"""Function that returns which places [N, 3] of the scene belong to the subject."""
+"""Function that maps points [N, 3] of the scene to a mask [N]: True for points of the subject."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,21 +27,24 @@ class Subject:
     """The part of a scene that is shown.
 
     Attributes:
-        inside: selects the part; None: everything.
-        description: description of the part.
+        inside: function that selects the points of the part; None selects the whole scene.
+        description: name of the part in messages.
     """
 
     inside: Inside | None
     description: str
 
     def holds(self, places: Tensor) -> Tensor:
-        """Return which places [N, 3] belong to it, [N] bool on their device."""
+        """Return a mask [N] on the device of the points [N, 3]: True for points of the subject."""
         if self.inside is None:
             return torch.ones(len(places), dtype=torch.bool, device=places.device)
         return torch.from_numpy(self.inside(places.detach().cpu().numpy())).to(places.device)
 
     def report_removed(self, inside: Tensor, run: OpenedRun, reporter: Reporter) -> None:
-        """Report the number of Gaussians [N] bool in the part, if some are outside, and the commands to change it."""
+        """Report how many Gaussians belong to the part, and the commands that change the part.
+
+        Without Gaussians outside the part, report no message.
+        """
         count = int(inside.sum())
         if count < len(inside):
             reporter.say(
@@ -52,14 +55,17 @@ class Subject:
 
 
 def subject_of(run: OpenedRun, *, masked: bool = False) -> Subject:
-    """Return the subject of a run: the crop box, the foreground of the masks, or the region that the cameras see.
+    """Return the subject of a run.
 
-    The first of these that exists is the subject. The foreground is decided by the majority of the pictures
-    that contain a place. The region contains the places that are in most of the pictures.
+    It is the crop box if the presentation has one. Otherwise it is the foreground of the masks, or without masks the
+    region that the cameras see.
+
+    A point belongs to the foreground if most of the pictures that contain it show it inside the mask. It belongs to the
+    region of the cameras if most pictures contain it.
 
     Args:
-        run: the run. The scene is read if it has masks, else only its poses.
-        masked: the subject must be inside the masks even if there is a crop box.
+        run: the run. If its scene has masks, the whole scene is read, otherwise only its poses.
+        masked: restrict the subject to the foreground of the masks even if there is a crop box.
 
     Raises:
         PolarguideError: ``masked`` is set and the scene has no masks, or the scene is missing.
@@ -94,7 +100,7 @@ def subject_of(run: OpenedRun, *, masked: bool = False) -> Subject:
 
 
 def part_shown(run: OpenedRun, reporter: Reporter) -> Within:
-    """Return the part of a run in a film, as an argument of renderings.
+    """Return the function that restricts renderings of a film to the subject.
 
     Args:
         run: the run.
@@ -114,11 +120,11 @@ def _in_masks(run: OpenedRun) -> Inside:
 
 
 def _by_majority(views: Sequence[tuple[Camera, Tensor | None]]) -> Inside:
-    """Return a function that selects the places with more votes for than against them.
+    """Return a function that selects each point with more votes for it than against it.
 
     Args:
-        views: cameras, and masks [H, W] bool. A view votes against places outside its mask, and abstains outside its
-            picture. Without a mask it votes against places outside its picture.
+        views: camera and mask [H, W] of each view. A view with a mask votes for points inside the mask and against
+            points outside it. It has no vote on points outside its picture. A view without a mask votes against those.
     """
 
     def inside(places: NDArray[Any]) -> NDArray[np.bool_]:

@@ -1,7 +1,7 @@
 """Textures of a scene: each texel is the weighted mean of its pixels in the views.
 
-A view counts if its rendered surface lies at the texel's depth. So occluders and the background do not stain
-the texture. The weight is the squared cosine of the viewing angle.
+A view contributes to a texel only if its rendered surface lies at the depth of the texel. So occluders and the
+background do not stain the texture. The weight of a view is the squared cosine of the viewing angle.
 """
 
 from __future__ import annotations
@@ -31,26 +31,31 @@ from polarguide.shading.surface import GltfTexture
 ColorSource = Literal["diffuse", "final", "photograph"]
 """Layer that provides the base color."""
 STEEPEST = 0.15
-"""Cosine of the viewing angle below which a view is ignored. Its pixels are stretched by a factor of seven."""
+"""Cosine of the viewing angle below which a view is ignored. A pixel covers seven times its width there."""
 NEAR = 2.0
-"""Maximum distance in voxels of a texel from the rendered depth, at perpendicular view."""
+"""Maximum distance between a texel and the rendered surface at a perpendicular view, in voxels."""
 SEEN = 0.05
-"""Sum of weights above which a texel counts as seen: one view at a cosine of 0.22."""
+"""Sum of weights above which a texel counts as seen. One view at a cosine of 0.22 reaches it."""
 _BATCH = 1 << 19  # texels
 _FILLED_FROM = 200_000
-"""Maximum number of seen texels in the search for the nearest one."""
+"""Maximum number of seen texels that are searched for the nearest one of an unseen texel."""
 
 
 @dataclass(frozen=True, eq=False)
 class Baked:
-    """Values of M texels, single precision.
+    """Baked values of M texels, in single precision.
 
     Attributes:
-        color: [M, 3] linear. roughness: [M] of glTF. metalness: [M]. strength: [M] of the reflection.
-        reflectance: [M, 3] of metals at normal incidence. index: [M] refractive index.
-        normal: [M, 3] learned, not normalized. seen: [M] bool, texels that some view shows.
-        nearest: [U] index of the nearest seen texel of each other texel, whose values it has.
-        added: [M, C] values in [0, 1] of surface properties with their own texture.
+        color: [M, 3] linear.
+        roughness: [M] roughness as defined by glTF.
+        metalness: [M] share of metal.
+        strength: [M] strength of the reflection.
+        reflectance: [M, 3] reflectance of metals at normal incidence.
+        index: [M] refractive index.
+        normal: [M, 3] learned normals, not normalized.
+        seen: [M] bool, texels that are visible in at least one view.
+        nearest: [U] index of the nearest seen texel for each unseen texel, which takes its values.
+        added: [M, C] values in [0, 1] of each surface property that has its own texture.
     """
 
     color: NDArray[np.float32]
@@ -80,9 +85,9 @@ CHANNELS = {
     "index": 1,
     "normal": 3,
 }
-"""Number of channels of each quantity. Rows of ``surface.SurfaceProperty`` with a texture follow."""
+"""Number of channels of each baked quantity. Surface properties with a texture of their own follow."""
 CONSTANTS = {"roughness": 1.0, "metalness": 0.0, "strength": 0.0}
-"""Values for recipes that do not learn them: a matte dielectric."""
+"""Default values for recipes that do not learn these quantities. They describe a matte dielectric."""
 
 
 @torch.no_grad()
@@ -95,11 +100,14 @@ def bake(
     voxel: float,
     reporter: Reporter,
 ) -> Baked:
-    """Sample the views at points of the surface.
+    """Average pixels of the views at points of the surface.
 
     Args:
-        run: the run. views: views to sample. places, normals: [M, 3] in the scene, unit normals.
-        color: the sampled layer or the photographs. voxel: side of a voxel of the fusion.
+        run: the run.
+        views: views to sample.
+        places, normals: [M, 3] in the scene, unit normals.
+        color: layer to sample for the base color, or the photographs.
+        voxel: side of a voxel in the fusion of depth maps.
         reporter: receives progress.
     """
     model = run.model
@@ -135,7 +143,7 @@ def bake(
 
 
 def _layers(model: GaussianModel, result: RenderResult, view: View, color: ColorSource) -> dict[str, Tensor]:
-    """Return pictures [H, W, C] of the channels in their order, for the surface alone: blended values over alpha."""
+    """Return a picture [H, W, C] of each baked quantity. Division by alpha removes the background."""
     alpha = result.alpha.clamp(min=0.05)[..., None]
     size = result.alpha.shape
     if color == "photograph":
@@ -157,7 +165,7 @@ def _layers(model: GaussianModel, result: RenderResult, view: View, color: Color
 
 
 def _reliable_depth(result: RenderResult, view: View | None) -> Tensor:
-    """Return the depth [H, W] of the surface, 0 for unreliable pixels.
+    """Return the depth [H, W] of the surface, with 0 at unreliable pixels.
 
     Unreliable pixels are translucent, on an outline, or invalid in the photograph of ``view``.
     """
@@ -174,7 +182,12 @@ def _reliable_depth(result: RenderResult, view: View | None) -> Tensor:
 def _visible(
     points: Tensor, normals: Tensor, camera: Camera, depth: Tensor, voxel: float
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the visible points: rows [K], weights [K], and pixel positions [K, 2] in [-1, 1] for ``grid_sample``."""
+    """Find the points that are visible in a view.
+
+    Returns:
+        The rows [K] of the visible points in ``points``, their weights [K], and their positions [K, 2] in the picture,
+        in [-1, 1] as for ``grid_sample``.
+    """
     offsets = points - camera.center.float()
     cosine = -dot(unit(offsets), normals)
     rows = (cosine > STEEPEST).nonzero()[:, 0]
@@ -198,7 +211,10 @@ def _visible(
 
 
 def _nearest_seen(places: NDArray[np.float32], visible: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Return the approximately nearest visible texel of each other texel, or the texel itself if none is visible."""
+    """Return the index of an approximately nearest visible texel for each invisible texel.
+
+    Without visible texels, return the index of each texel itself.
+    """
     known = visible.nonzero()[0]
     unseen = (~visible).nonzero()[0]
     if not len(known) or not len(unseen):

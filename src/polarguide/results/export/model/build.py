@@ -40,13 +40,13 @@ BASE_COLORS: dict[BaseColor, str] = {
     "photographs": "mean of the photographs, highlights and shading baked in",
     "picture": "mean of the rendered pictures, highlights and shading baked in",
 }
-"""Description of each kind of base color in exported files."""
+"""Description of each kind of base color, for exported files."""
 WHITEST = 0.9
 """Reflectance of the whitest common surfaces, such as white paint and porcelain."""
 BRIGHT_SHARE = 0.01
-"""Share of the surface, such as highlights and noise, that may exceed ``WHITEST`` before a global scale applies."""
+"""Share of the surface, such as highlights, that may exceed ``WHITEST`` before all colors are scaled down."""
 SURROUNDINGS_RESOLUTION = 128
-"""Voxels along the longest side of the scene outside the crop box, which only casts soft shadows."""
+"""Number of voxels along the longest side of the scene outside the crop box. It only casts soft shadows."""
 _BATCH = 1 << 18  # texels per batch of the irradiance, about 100 MB
 BYTES_PER_TEXEL = 190
 """Peak memory per texel during baking and filling of textures."""
@@ -56,7 +56,7 @@ def require_room(texture: int) -> None:
     """Check that a square texture fits into memory.
 
     Args:
-        texture: texels along its side.
+        texture: number of texels along its side.
 
     Raises:
         PolarguideError: the texture does not fit.
@@ -77,9 +77,11 @@ class Charted:
     """Subject of a run as a mesh with texture coordinates.
 
     Attributes:
-        mesh: the mesh with colors of the diffuse layer. inside: region of the subject. voxel: side of a voxel
-            of the fusion.
-        unwrapped: the mesh, split along the borders of charts. texels: texels of the texture.
+        mesh: the mesh, with colors of the diffuse layer.
+        inside: function that selects points of the subject, or None for the whole scene.
+        voxel: side of a voxel of the fusion.
+        unwrapped: the mesh, split along the borders of its charts. A chart is a connected part of the texture.
+        texels: texels that lie on a triangle of the mesh.
     """
 
     mesh: ColoredMesh
@@ -101,14 +103,17 @@ def charted_subject(
     """Return the surface of the subject with texture coordinates.
 
     Args:
-        run: the run; its scene is read. surface_view: renders a view of the subject's Gaussians.
-        inside: region of the subject; None for everything. options: options of the model.
+        run: the run; its scene is read.
+        surface_view: renders a view of the subject's Gaussians.
+        inside: function that selects points of the subject, or None for the whole scene.
+        options: options of the model.
         resolution: number of voxels along its longest side.
-        folder: folder for temporary files. reporter: receives progress, counts and warnings.
+        folder: folder for temporary files.
+        reporter: receives progress, counts and warnings.
 
     Raises:
-        PolarguideError: a package is missing, the texture does not fit into memory, there is no surface, or
-            delighting needs radiance that the recipe does not learn.
+        PolarguideError: a package is missing, the texture does not fit into memory, there is no surface, or the recipe
+            does not learn the radiance that delighting needs.
     """
     require_room(options.texture)
     if options.resolved_base_color == "delit":
@@ -132,9 +137,11 @@ def textured_model(
     """Return the subject of a run as a textured mesh, +y up.
 
     Args:
-        run: the run; its scene is read. subject: its surface. presentation, placement: color, and scale of
-            the file.
-        options: options of the model. reporter: receives progress and counts.
+        run: the run; its scene is read.
+        subject: surface of the subject.
+        presentation, placement: color and scale of the file.
+        options: options of the model.
+        reporter: receives progress and counts.
     """
     mesh = subject.mesh
     unwrapped = subject.unwrapped
@@ -174,12 +181,12 @@ def textured_model(
 def _presented(
     baked: Baked, light: NDArray[np.float32] | None, color: Tensor | None, index: float, reporter: Reporter
 ) -> tuple[NDArray[np.float32], Baked]:
-    """Apply the color of the presentation, and divide radiance by the irradiance ``light`` [M, 3] if given.
+    """Apply the color of the presentation, and divide radiance by ``light``, the irradiance [M, 3], unless it is None.
 
-    Radiance and irradiance get the color of the presentation before the division.
+    The color of the presentation is applied to radiance and irradiance before the division.
 
     Returns:
-        Base color [M, 3] of linear sRGB, and the texels with the adapted reflectance of metals.
+        The base color [M, 3] in linear sRGB, and the texels with the reflectance of metals in the same color.
     """
     metal = colored_reflectance(torch.from_numpy(baked.reflectance), color).numpy()
     colors = colored(torch.from_numpy(baked.color), color).numpy()
@@ -190,9 +197,9 @@ def _presented(
 
 
 def _within_white(color: NDArray[np.float32], baked: Baked, reporter: Reporter) -> NDArray[np.float32]:
-    """Scale delit colors [M, 3] to reflectances of at most ``WHITEST`` and clip the rest without a change of hue.
+    """Scale base colors [M, 3] without shading to at most ``WHITEST``, and clip outliers without a change of hue.
 
-    Delit color has an unknown common factor. Brighter texels contain light that the environment lacks.
+    The common factor of these colors is unknown. Brighter texels contain light that the environment lacks.
     """
     dielectric = color[baked.seen & (baked.metalness < 0.5)]
     brightest = float(np.quantile(dielectric.max(axis=1), 1 - BRIGHT_SHARE)) if len(dielectric) else 0.0
@@ -205,7 +212,7 @@ def _within_white(color: NDArray[np.float32], baked: Baked, reporter: Reporter) 
 
 
 def _unit(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Normalize vectors [V, 3]; +y for a zero vector."""
+    """Normalize vectors [V, 3]. A zero vector becomes +y."""
     length = np.linalg.norm(vectors, axis=1, keepdims=True)
     return np.where(length > 1e-9, vectors / np.maximum(length, 1e-9), [[0.0, 1.0, 0.0]])
 
@@ -220,7 +227,7 @@ def _index(run: OpenedRun) -> float:
 
 
 def _learned(normals: NDArray[np.float32], facing: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return unit normals [M, 3]: the learned ones, or those of the mesh for missing or inward ones."""
+    """Normalize learned normals [M, 3]. Missing or inward normals are replaced by normals of the mesh."""
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     agrees = (length > 1e-3) & ((normals * facing).sum(axis=1, keepdims=True) > 0)
     return np.where(agrees, normals / np.maximum(length, np.float32(1e-3)), facing)
@@ -233,7 +240,7 @@ def _irradiance(
     normals: NDArray[np.float32],
     index: float,
 ) -> NDArray[np.float32]:
-    """Return the irradiance [M, 3] at the texels from light [V, K, 3] at the vertices."""
+    """Interpolate incident light [V, K, 3] from vertices to texels, and return the irradiance [M, 3] of the texels."""
     count = arriving.shape[1]
     light = np.empty_like(normals)
     for begin in range(0, len(normals), _BATCH):
@@ -265,7 +272,7 @@ def _arriving(
 
 
 def _outside(run: OpenedRun, inside: Inside) -> ColoredMesh:
-    """Return the mesh of the scene outside the subject, which shades the subject and reflects light."""
+    """Return a mesh of the scene outside the subject. It casts shadows on the subject and reflects light to it."""
     surface, views, box = fused_surface(run.cameras, run.result, resolution=SURROUNDINGS_RESOLUTION)
     mesh = painted(surface, views, box)
     faces = surface.faces[~inside(surface.vertices)[surface.faces].any(axis=1)]

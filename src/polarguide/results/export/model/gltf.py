@@ -22,15 +22,15 @@ from polarguide.optics.color import srgb_encode_array
 from polarguide.shading.surface import GltfTexture
 
 ARRAY = 34962
-"""Target of a buffer view with vertex attributes."""
+"""Value of ``target`` for a buffer view with vertex attributes."""
 ELEMENTS = 34963
-"""Target of a buffer view with vertex indices."""
+"""Value of ``target`` for a buffer view with vertex indices."""
 _COMPONENTS = {np.dtype("<f4"): 5126, np.dtype("<u4"): 5125, np.dtype("u1"): 5121}
 _TYPES = {1: "SCALAR", 2: "VEC2", 3: "VEC3", 4: "VEC4"}
 
 
 class Binary:
-    """Arrays and files of one GLB, in the order of their addition."""
+    """Builder of one GLB file from arrays and embedded files."""
 
     def __init__(self) -> None:
         self._data = bytearray()
@@ -38,7 +38,7 @@ class Binary:
         self._accessors: list[dict[str, Any]] = []
 
     def view(self, data: bytes, target: int | None = None) -> int:
-        """Add bytes and return the index of their buffer view."""
+        """Add bytes to the file, and return the index of their buffer view."""
         self._data += bytes(-len(self._data) % 4)
         view = {"buffer": 0, "byteOffset": len(self._data), "byteLength": len(data)}
         self._views.append(view if target is None else {**view, "target": target})
@@ -46,11 +46,12 @@ class Binary:
         return len(self._views) - 1
 
     def array(self, values: NDArray[Any], target: int = ARRAY, *, bounds: bool = False) -> int:
-        """Add values [N] or [N, C], float32, uint32 or normalized uint8, and return the index of their accessor.
+        """Add values [N] or [N, C] (float32, uint32 or normalized uint8), and return the index of their accessor.
 
         Args:
-            values: the array. target: target of the buffer view.
-            bounds: record the minimum and the maximum, which positions require.
+            values: the array.
+            target: target of the buffer view.
+            bounds: record minimum and maximum, as glTF requires for positions.
         """
         table = values.reshape(len(values), -1)
         accessor: dict[str, Any] = {
@@ -71,9 +72,10 @@ class Binary:
         """Write a file with one primitive.
 
         Args:
-            path: the file. asset: glTF asset record without the version. primitive: primitive of the only
-                mesh.
-            more: additional fields of the tree.
+            path: the file.
+            asset: asset record of glTF without the version.
+            primitive: primitive of the only mesh in the file.
+            more: additional fields at the top level of the glTF record.
 
         Raises:
             PolarguideError: the file cannot be written.
@@ -105,13 +107,17 @@ Pixels = NDArray[np.uint8]
 
 @dataclass(frozen=True, eq=False)
 class Textured:
-    """Mesh with textures, in the axes and units of the file.
+    """Mesh with textures, in the axes and units of an exported file.
 
     Attributes:
-        vertices, normals: [V, 3]. uv: [V, 2], with v down from the first row. faces: [F, 3].
-        base_color: [T, T, 3] sRGB. surface: [T, T, 3] roughness in green, metalness in blue; None for unlit.
-        specular: [T, T] factor on a dielectric's reflection; None for 1. index: refractive index.
-        added: [T, T, 3] textures of added surface properties, only for GLB files.
+        vertices, normals: [V, 3].
+        uv: [V, 2] texture coordinates. v points down from the first row of the texture.
+        faces: [F, 3].
+        base_color: [T, T, 3] sRGB.
+        surface: [T, T, 3] texture with roughness in green and metalness in blue, or None for an unlit mesh.
+        specular: [T, T] factor on the reflection of dielectrics. None means 1 everywhere.
+        index: refractive index.
+        added: [T, T, 3] textures of additional surface properties. Only GLB files contain them.
     """
 
     vertices: NDArray[np.float64]
@@ -126,17 +132,20 @@ class Textured:
 
 
 def color_pixels(linear: NDArray[np.float32]) -> Pixels:
-    """Encode linear colors as sRGB bytes, the encoding of base color in glTF."""
+    """Encode linear colors as sRGB bytes, as glTF requires for base color."""
     return np.asarray(np.rint(255 * srgb_encode_array(np.clip(linear, 0, 1))), np.uint8)
 
 
 def linear_pixels(values: NDArray[np.float32]) -> Pixels:
-    """Encode values in [0, 1] as bytes, the encoding of roughness, metalness and factors in glTF."""
+    """Encode values in [0, 1] as linear bytes, as glTF requires for roughness, metalness and factors."""
     return np.asarray(np.rint(255 * np.clip(values, 0, 1)), np.uint8)
 
 
 def encoded(pixels: Pixels, *, jpeg: bool) -> tuple[str, bytes]:
-    """Encode a picture [H, W, 3 or 4] and return its media type and file; transparency requires PNG."""
+    """Encode a picture [H, W, 3 or 4], and return its media type and the bytes of the file.
+
+    A picture with transparency is encoded as PNG even if ``jpeg`` is set.
+    """
     kind = "jpeg" if jpeg else "png"
     file = io.BytesIO()
     Image.fromarray(pixels).save(file, kind, quality=QUALITY)
@@ -147,7 +156,9 @@ def write_glb(path: Path, model: Textured, asset: dict[str, Any], *, jpeg: bool)
     """Write a textured mesh.
 
     Args:
-        path: the file. model: the mesh. asset: glTF asset record without the version.
+        path: the file.
+        model: the mesh.
+        asset: glTF asset record without the version.
         jpeg: encode base color, roughness and metalness as JPEG instead of PNG.
 
     Raises:
@@ -172,7 +183,7 @@ def write_glb(path: Path, model: Textured, asset: dict[str, Any], *, jpeg: bool)
 
 
 def _material(model: Textured, *, jpeg: bool) -> tuple[list[tuple[str, bytes]], dict[str, Any], list[str]]:
-    """Return the images, the material that references them by index, and its extensions."""
+    """Return the images of a mesh, the material that references them by index, and the extensions that it uses."""
     images = [encoded(model.base_color, jpeg=jpeg)]
     shading: dict[str, Any] = {"baseColorTexture": {"index": 0}}
     material: dict[str, Any] = {"name": "surface", "pbrMetallicRoughness": shading}
@@ -204,8 +215,10 @@ def write_obj(folder: Path, model: Textured, lines: Sequence[str], *, jpeg: bool
     """Write ``model.obj``, ``model.mtl`` and the textures ``model-color``, ``model-roughness`` and ``model-metalness``.
 
     Args:
-        folder: folder to write. model: the mesh. lines: comments. jpeg: encode the color as JPEG instead of
-            PNG.
+        folder: folder to write.
+        model: the mesh.
+        lines: comments.
+        jpeg: encode the color as JPEG instead of PNG.
 
     Raises:
         PolarguideError: a file cannot be written.

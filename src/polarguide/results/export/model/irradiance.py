@@ -1,12 +1,12 @@
-"""Irradiance of a mesh under the learned light. Division of the diffuse layer by it removes shading.
+"""Irradiance of a mesh under the learned light. Dividing the diffuse layer by the irradiance removes shading.
 
 A smooth dielectric with a diffuse base of albedo a has, at normal incidence, the diffuse radiance
 
     D = a T(0) E,   E = (1 / pi) integral of T(i) L(w) cos(i) dw
 
 with the share T of light that passes its surface. L is the radiance of the environment, or the diffuse layer
-of an occluder. The diffuse layer already contains all further bounces. Rays start at the vertices and are
-stored as spherical harmonics. The normals are those of the texels, so that edges stay sharp.
+of an occluder. The diffuse layer already contains all further bounces. Rays start at the vertices, and their light is
+stored as spherical harmonics. The integral uses the normals of the texels, so that edges stay sharp.
 """
 
 from __future__ import annotations
@@ -32,12 +32,12 @@ from polarguide.results.rendering.mesh import ColoredMesh
 RAYS = 384
 """Number of rays per vertex. The noise of their mean is a few percent, and interpolation smooths it."""
 DEGREE = 2
-"""Degree of the harmonics of incident light. A cosine lobe removes higher ones (Ramamoorthi and Hanrahan 2001)."""
+"""Degree of the harmonics of incident light. A cosine lobe removes higher degrees (Ramamoorthi and Hanrahan 2001)."""
 _BATCH = 1 << 19  # rays, about 100 MB
 OFFSET = 2.5e-3
 """Offset of the rays from the surface, relative to the diagonal of the occluders."""
 FLOOR = 0.05
-"""Lower bound of irradiance relative to its mean over the mesh. Division by less would amplify noise."""
+"""Lower bound of the irradiance, relative to its mean over the mesh. Dividing by smaller values amplifies noise."""
 
 WHAT = "--base-color delit"
 Radiance = Callable[[NDArray[np.float64]], NDArray[np.float64]]
@@ -49,7 +49,7 @@ class Surroundings:
 
     Attributes:
         radiance: radiance of the environment.
-        occluder: mesh in front of the environment, with linear diffuse radiance at its vertices.
+        occluder: mesh that hides parts of the environment, with linear diffuse radiance at its vertices.
     """
 
     radiance: Radiance
@@ -57,7 +57,7 @@ class Surroundings:
 
 
 def arriving_light(points: Places, normals: Places, around: Surroundings, advance: Advance) -> Places:
-    """Return harmonics [V, K, 3] of the incident light at points [V, 3] of a surface with unit normals [V, 3].
+    """Trace rays from points [V, 3] with unit normals [V, 3], and return harmonics [V, K, 3] of the incident light.
 
     Raises:
         PolarguideError: embreex is not installed.
@@ -80,7 +80,7 @@ def arriving_light(points: Places, normals: Places, around: Surroundings, advanc
 
 
 def irradiance(light: NDArray[Any], normals: NDArray[Any], index: float) -> NDArray[np.float32]:
-    """Return the irradiance [M, 3] of a dielectric with unit normals [M, 3] from harmonics of light [M, K, 3]."""
+    """Compute the irradiance [M, 3] of a dielectric from harmonics of light [M, K, 3] and unit normals [M, 3]."""
     cosines, weights = np.polynomial.legendre.leggauss(64)
     cosines = (cosines + 1) / 2
     weights = weights / 2
@@ -98,7 +98,7 @@ def _basis(directions: NDArray[Any]) -> Places:
 
 
 def delit(diffuse: NDArray[np.float32], light: NDArray[np.float32], index: float) -> NDArray[np.float32]:
-    """Return the base color [..., 3] of a diffuse layer and its irradiance; see the module's formula."""
+    """Compute the base color [..., 3] from the diffuse layer and the irradiance by the formula of this module."""
     floored = np.maximum(light, np.float32(FLOOR * light.mean()))
     passed = np.float32(1 - _reflectance(np.ones(1), index)[0])
     return np.asarray(diffuse / (floored * passed), np.float32)
@@ -110,7 +110,7 @@ def _reflectance(cosine: NDArray[np.float64], index: float) -> NDArray[np.float6
 
 
 class _Rays:
-    """Embree scene of a mesh.
+    """Embree scene of a mesh, for ray tracing.
 
     Raises:
         PolarguideError: embreex is not installed.
@@ -126,7 +126,10 @@ class _Rays:
         self._geometry = meshes.TriangleMesh(self._scene, corners)  # The scene holds no reference.
 
     def arriving(self, origins: Places, directions: Places, radiance: Radiance) -> Places:
-        """Return the radiance [N, 3] at origins from unit directions [N, 3], of the mesh or the environment."""
+        """Return the radiance [N, 3] that arrives at each origin from a unit direction [N, 3].
+
+        It comes from the mesh if the ray hits it, otherwise from the environment.
+        """
         starts, rays = (np.ascontiguousarray(values, np.float32) for values in (origins, directions))
         hits = self._scene.run(starts, rays, output=True)
         light = radiance(directions)

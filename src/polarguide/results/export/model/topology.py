@@ -1,4 +1,4 @@
-"""Clean mesh of a run's subject: a simplified manifold with counted boundary edges."""
+"""Cleaning of the mesh of a run's subject: simplification, removal of small pieces, and closing of holes."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ from polarguide.runs.opened import OpenedRun
 from polarguide.shading.result import RenderResult
 
 ISLAND = 0.01
-"""Share of the largest piece's faces below which a piece is removed."""
+"""Minimum number of faces of a piece, relative to the largest piece. Smaller pieces are removed."""
 WELD = 1e-6
-"""Distance, relative to the longest side, below which vertices are merged."""
+"""Distance below which vertices are merged, relative to the longest side of the mesh."""
 SMALL_HOLE = 0.1
-"""Perimeter, relative to the diagonal of the mesh, up to which a hole is closed.
+"""Largest perimeter of a hole that is closed, relative to the diagonal of the mesh.
 
 Larger holes are regions that no camera saw.
 """
@@ -46,7 +46,7 @@ Places = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Topology:
-    """Counts of a mesh.
+    """Numbers of edges and pieces that show if a mesh is closed and manifold.
 
     Attributes:
         boundary_edges: edges with one face.
@@ -69,12 +69,12 @@ def topology(faces: Faces) -> Topology:
 
 
 def _directed(faces: Faces) -> NDArray[np.int64]:
-    """Return the edges of each face in its orientation, [3 F, 2]. Face f has the edges 3 f to 3 f + 2."""
+    """Return the directed edges of all faces, [3 F, 2]. Face f has the edges 3 f to 3 f + 2."""
     return faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
 
 
 def _keys(edges: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return one number for each pair of vertices [N, 2]."""
+    """Return a number that identifies each pair of vertices [N, 2]."""
     return edges[:, 0] << 32 | edges[:, 1]
 
 
@@ -97,10 +97,14 @@ def simplified(surface: Surface, triangles: int, *, closed: bool = False) -> Sur
 
 
 def cleaned(vertices: Places, faces: Faces, *, closed: bool = False) -> Surface:
-    """Return a surface whose edges occur at most once in each direction, without islands and small holes.
+    """Remove small pieces, close small holes, and make faces consistent.
+
+    In the result, each edge occurs at most once in each direction.
 
     Args:
-        closed: close every hole with a flat fan, such as the bottom of an object on a table.
+        vertices: vertices of the mesh.
+        faces: faces of the mesh.
+        closed: close holes of any size with a flat fan, such as the bottom of an object on a table.
 
     Raises:
         NoSurfaceError: no face is left.
@@ -120,7 +124,7 @@ def cleaned(vertices: Places, faces: Faces, *, closed: bool = False) -> Surface:
 
 
 def _welded(vertices: Places, faces: Faces) -> tuple[Places, Faces]:
-    """Merge vertices that single precision hardly distinguishes."""
+    """Merge vertices that are nearly equal in single precision."""
     size = np.ptp(vertices, axis=0).max()
     cells = np.rint((vertices - vertices.min(axis=0)) / max(WELD * float(size), 1e-30)).astype(np.int64)
     _, first, number = np.unique(cells, axis=0, return_index=True, return_inverse=True)
@@ -128,10 +132,10 @@ def _welded(vertices: Places, faces: Faces) -> tuple[Places, Faces]:
 
 
 def consistent(vertices: Places, faces: Faces) -> Faces:
-    """Remove degenerate faces, and all but one of the faces with the same edge in the same direction.
+    """Remove degenerate faces, and faces that have the same edge in the same direction as another face.
 
-    Then no edge has more than two faces, and these have a consistent orientation. The face with the best fit
-    to its neighbors stays, or the largest of equally good ones.
+    Afterwards an edge has at most two faces, and their orientation is consistent. From faces with a common directed
+    edge, the one with the best fit to its neighbors is kept, or the largest of equally good ones.
     """
     corners = np.sort(faces, axis=1)
     faces = faces[(corners[:, 0] < corners[:, 1]) & (corners[:, 1] < corners[:, 2])]
@@ -154,7 +158,10 @@ def consistent(vertices: Places, faces: Faces) -> Faces:
 
 
 def _closed(vertices: Places, faces: Faces, largest: float) -> tuple[Places, Faces]:
-    """Close holes up to a perimeter, relative to the diagonal, with a fan of triangles around their center."""
+    """Close holes with a fan of triangles around their center.
+
+    ``largest`` is the largest perimeter of a hole to close, relative to the diagonal of the mesh.
+    """
     directed = _directed(faces)
     edges = directed[~np.isin(_keys(directed), _keys(directed[:, ::-1]))]
     limit = largest * float(np.linalg.norm(np.ptp(vertices, axis=0)))
@@ -175,7 +182,7 @@ def _closed(vertices: Places, faces: Faces, largest: float) -> tuple[Places, Fac
 def _loops(edges: list[list[int]]) -> list[list[int]]:
     """Decompose boundary edges into simple cycles. Each vertex must have as many incoming as outgoing edges.
 
-    Holes that touch in a vertex have separate cycles, so that no edge of a fan has a third face.
+    Holes that touch at a vertex become separate cycles. Otherwise an edge of a fan would have a third face.
     """
     following: dict[int, list[int]] = {}
     for begin, end in edges:
@@ -198,7 +205,7 @@ def _loops(edges: list[list[int]]) -> list[list[int]]:
 
 
 def vertex_normals(vertices: Places, faces: Faces) -> Places:
-    """Return unit normals [V, 3], the area-weighted mean of the adjacent faces; +z if they cancel."""
+    """Return unit normals [V, 3] of vertices: the area-weighted mean over adjacent faces, or +z if they cancel."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     across = np.cross(b - a, c - a)
     total = np.stack(
@@ -220,9 +227,9 @@ def subject_surface(
     resolution: int,
     reporter: Reporter,
 ) -> tuple[Surface, list[tuple[Camera, DepthSamples]], Box]:
-    """Return the simplified surface of the subject, the depth samples of each camera, and the grid of the fusion.
+    """Return the simplified surface of the subject, the depth samples of each camera, and the grid of voxels.
 
-    The reporter receives the counts of the surface.
+    The numbers of edges and pieces are reported to ``reporter``.
 
     Raises:
         PolarguideError: there is no surface.
@@ -243,8 +250,10 @@ def write_stl(path: Path, vertices: Places, faces: NDArray[np.int64], comment: s
     """Write a binary STL file.
 
     Args:
-        path: the file. vertices: [V, 3] in the axes of the file. faces: [F, 3].
-        comment: text for the header, of which 80 characters are kept. It must not begin with "solid".
+        path: the file.
+        vertices: [V, 3] in the axes of the file.
+        faces: [F, 3].
+        comment: text for the header. Only its first 80 characters are kept. It must not begin with "solid".
 
     Raises:
         PolarguideError: the file cannot be written.

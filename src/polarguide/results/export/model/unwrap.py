@@ -1,4 +1,4 @@
-"""Texture atlas of a mesh: texture coordinates, positions of the texels on the surface, and filled textures.
+"""Texture atlas of a mesh: texture coordinates, positions of the texels on the surface, and filling of textures.
 
 xatlas runs in a separate process, because it cannot be interrupted.
 """
@@ -20,9 +20,9 @@ from polarguide.core.errors import PolarguideError, optional_import
 from polarguide.core.progress import Reporter
 
 PADDING = 256
-"""Size of the mip map in which charts are one texel apart, which gives 8 texels at 2,048."""
+"""Size of the mip map level in which charts are one texel apart. At 2,048 texels their distance is 8 texels."""
 SLACK = 1.25
-"""Factor on the requested padding, because xatlas scales an oversized atlas down."""
+"""Factor on the requested padding, because xatlas scales down an atlas that is too large."""
 SLOW = 300_000
 """Number of triangles above which xatlas is slow. Its time grows faster than linearly."""
 _ENTRY = "from polarguide.results.export.model.unwrap import run_xatlas; run_xatlas()"
@@ -30,11 +30,13 @@ _ENTRY = "from polarguide.results.export.model.unwrap import run_xatlas; run_xat
 
 @dataclass(frozen=True, eq=False)
 class Unwrapped:
-    """Mesh whose vertices are split along the borders of charts.
+    """Mesh with texture coordinates, whose vertices are split along the borders of its charts.
 
     Attributes:
-        source: [W] original vertex of each vertex. faces: [F, 3] of the new vertices.
-        uv: [W, 2] in [0, 1], with v from the first row of the texture. charts: number of charts.
+        source: [W] index of the original vertex for each vertex.
+        faces: [F, 3] indices of the split vertices.
+        uv: [W, 2] in [0, 1]. v is 0 at the first row of the texture.
+        charts: number of charts.
     """
 
     source: NDArray[np.int64]
@@ -49,8 +51,11 @@ def unwrap(
     """Cut a mesh into charts and pack them into a square texture.
 
     Args:
-        vertices: [V, 3]. faces: [F, 3]. texture: texels along its side.
-        folder: folder for exchanged files. reporter: receives progress, and a warning about many triangles.
+        vertices: [V, 3].
+        faces: [F, 3].
+        texture: texels along its side.
+        folder: folder for exchanged files.
+        reporter: receives progress, and a warning about many triangles.
 
     Raises:
         PolarguideError: xatlas fails, for example because of insufficient memory.
@@ -83,7 +88,10 @@ def unwrap(
 
 
 def run_xatlas() -> None:
-    """Unwrap the mesh in the first file of the command line and write the atlas to the second file."""
+    """Unwrap a mesh in a separate process.
+
+    The command line names the file of the mesh and the file to which the atlas is written.
+    """
     xatlas = optional_import("xatlas", "a textured model")
     task, answer = sys.argv[1:3]
     with np.load(task) as mesh:
@@ -104,11 +112,13 @@ _CANDIDATES = 1 << 21  # pairs of triangle and texel per batch, about 200 MB
 
 @dataclass(frozen=True, eq=False)
 class Texels:
-    """The M texels of a square texture whose centers lie on a triangle.
+    """Texels of a square texture whose centers lie on a triangle, M in number.
 
     Attributes:
-        size: texels along the texture's side. index: [M] row times ``size`` plus column.
-        face: [M] triangle of each texel. weights: [M, 3] barycentric coordinates, single precision.
+        size: texels along the texture's side.
+        index: [M] index of each texel: row times ``size`` plus column.
+        face: [M] index of the triangle of each texel.
+        weights: [M, 3] barycentric coordinates in the triangle, in single precision.
     """
 
     size: int
@@ -117,14 +127,14 @@ class Texels:
     weights: NDArray[np.float32]
 
     def interpolated(self, faces: NDArray[np.int64], values: NDArray[Any]) -> NDArray[np.float32]:
-        """Interpolate values [V, C] at the vertices of faces to the texels, [M, C]."""
+        """Interpolate values [V, C] from the vertices of ``faces`` to the texels, [M, C]."""
         out = np.zeros((len(self.index), values.shape[1]), np.float32)
         for corner in range(3):
             out += self.weights[:, corner, None] * values[faces[self.face, corner]].astype(np.float32)
         return out
 
     def texture(self, values: NDArray[Any]) -> NDArray[np.float32]:
-        """Return a texture [size, size, C] of values [M, C]. Texels outside the charts have the nearest value."""
+        """Write values [M, C] into a texture [size, size, C]. Texels outside the charts take the nearest value."""
         picture = np.zeros((self.size * self.size, values.shape[1]), np.float32)
         empty = np.ones(self.size * self.size, bool)
         picture[self.index] = values
@@ -136,7 +146,7 @@ class Texels:
 
 
 def rasterized_texels(mesh: Unwrapped, size: int) -> Texels:
-    """Rasterize the triangles of a mesh in its texture of ``size`` x ``size`` texels.
+    """Rasterize the triangles of a mesh into its texture of ``size`` x ``size`` texels.
 
     Raises:
         PolarguideError: no texel lies on a triangle.
@@ -170,7 +180,7 @@ def _inside(
     counts: NDArray[np.int64],
     faces: NDArray[np.int64],
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], NDArray[np.float32]]:
-    """Return columns, rows, faces and barycentric coordinates of the texels inside some of the triangles."""
+    """Return columns, rows, faces and barycentric coordinates of the texels inside a batch of triangles."""
     face = np.repeat(faces, counts[faces])
     number = np.arange(len(face)) - np.repeat(np.cumsum(counts[faces]) - counts[faces], counts[faces])
     column = low[face, 0] + number % np.maximum(extent[face, 0], 1)
