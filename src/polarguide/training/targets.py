@@ -65,9 +65,7 @@ class ViewPriors:
 
     @cached_property
     def chromatic_total(self) -> Tensor:
-        """Divisor of means with ``chromatic_weight``: the sum of weights, but at least ``chromatic_share`` of all
-        pixels.
-        """
+        """Divisor of means with ``chromatic_weight``: its sum, but at least ``chromatic_share`` of all pixels."""
         return _total(self.chromatic_weight, self.chromatic_share)
 
 
