@@ -234,8 +234,9 @@ def densify(
 
 
 def _children(gaussians: Gaussians, split: Tensor, generator: torch.Generator) -> dict[str, Tensor]:
-    """Return two new Gaussians for each split Gaussian. Their positions are drawn from it, and they are 1.6 times
-    smaller.
+    """Return two new Gaussians for each split Gaussian.
+
+    Their positions are drawn from the split Gaussian, and they are 1.6 times smaller.
     """
     values = {
         name: gaussians[name].detach()[split].repeat(2, *[1] * (gaussians[name].ndim - 1))

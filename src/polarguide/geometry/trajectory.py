@@ -105,7 +105,7 @@ def interpolated(cameras: Sequence[Camera], frames: int) -> list[Camera]:
 
 
 def _level_axes(around: SceneFrame, begin: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the level direction from the center to ``begin`` [3], and the level direction a quarter turn to its left."""
+    """Return the level direction from the center to ``begin`` [3], and that direction turned left by 90 degrees."""
     offset = begin - around.center
     level = offset - dot(offset, around.up) * around.up
     if float(level.norm()) < 1e-6 * around.distance:

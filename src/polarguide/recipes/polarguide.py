@@ -31,7 +31,10 @@ def _stages(
     hold_normals: bool = True,
     behind: tuple[float, float] | None = BEHIND,
 ) -> tuple[Stage, ...]:
-    """Return the three stages of PolarGuide-GSDR. The guided stage is split in two: with and without density control."""
+    """Return the three stages of PolarGuide-GSDR.
+
+    The guided stage is split into a part with density control and a part without.
+    """
     enter: tuple[Action, ...] = ("refresh_priors",)
     orient: tuple[Action, ...] = ("orient_normals",) if oriented else ()
     return (
