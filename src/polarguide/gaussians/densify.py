@@ -1,8 +1,7 @@
 """Adaptive density control (Kerbl et al. 2023, Sec. 5.2): clone, split and prune, and their statistics.
 
-Free space, just in front of the cameras, has no surface. A Gaussian close to one camera explains that one picture and
-occludes every new view nearby. The SfM points bound the distance of the nearest surface of a view, in front of which
-space is free.
+The space just in front of each camera is assumed to be free of surfaces. A Gaussian in this space would explain one
+picture and occlude all new views nearby. The SfM points that a camera sees limit the distance of its nearest surface.
 """
 
 from __future__ import annotations
@@ -20,11 +19,11 @@ from polarguide.geometry.camera import Camera
 
 @dataclass(frozen=True, eq=False)
 class FreeSpace:
-    """Balls about the cameras.
+    """Balls around the cameras that contain no surface.
 
     Attributes:
         centers: [V, 3] camera centers.
-        radii: [V], 0 for a camera that sees no point.
+        radii: [V] radii of the balls; 0 for a camera that sees no point.
     """
 
     centers: Tensor
@@ -35,18 +34,18 @@ class FreeSpace:
         return FreeSpace(self.centers.to(device), self.radii.to(device))
 
     def contains(self, means: Tensor) -> Tensor:
-        """Return a mask [N] of the positions [N, 3] inside."""
+        """Return a mask [N], True for positions [N, 3] inside a ball."""
         return (torch.cdist(means, self.centers) < self.radii).any(dim=1)
 
 
 def free_space(points: Tensor, cameras: Sequence[Camera], share: float, quantile: float) -> FreeSpace:
-    """Return the free space in front of cameras that see SfM points [M, 3].
+    """Compute the free space around each camera from the SfM points that it sees.
 
     Args:
         points: [M, 3] SfM points.
         cameras: the cameras.
-        share: free share of the depth of a view's nearest points.
-        quantile: quantile of the depths that counts as the nearest.
+        share: radius of the free space, as a share of the depth of the nearest points.
+        quantile: quantile of the points' depths that is used as the depth of the nearest points.
     """
     radii = []
     for camera in cameras:
@@ -62,28 +61,32 @@ def free_space(points: Tensor, cameras: Sequence[Camera], share: float, quantile
 
 @dataclass(frozen=True)
 class Densification:
-    """Thresholds of the density control.
+    """Thresholds of the density control, which adds and removes Gaussians during a training.
 
     Attributes:
-        every: steps between two rounds.
-        gradient: mean gradient of the loss with respect to the projected mean, in units of half a picture, above which
-            a Gaussian is cloned or split.
-        dense_share: share of the scene's extent above which a Gaussian is split; smaller ones are cloned.
+        every: number of steps between two rounds.
+        gradient: mean gradient of the loss with respect to the projected center, in units of half a picture. Gaussians
+            with a larger gradient are cloned or split.
+        dense_share: share of the scene's extent. Larger Gaussians are split, and smaller Gaussians are cloned.
         minimum_opacity: opacity below which a Gaussian is pruned.
-        maximum_scale_share: share of the extent above which Gaussians within it are pruned.
-        far_scale_share: share of the distance above which Gaussians beyond the extent are pruned; a little more than
-            the widest of the initial shell of the surroundings (``Initialization``).
-        large_from: share of all steps after which huge Gaussians are pruned: 3,000 of 30,000 in the release, which is
-            the interval of its opacity resets.
-        large_minimum: least step at which they are pruned.
-        pixels_each: least number of pixels, of all training pictures, for each Gaussian. A Gaussian has about sixty
-            parameters and a pixel three values: with fewer than twenty pixels each, unknowns outnumber data.
-        faint_pixels: least sum of the blending weights of a Gaussian in some training picture, at the end of the
-            density control. Others are pruned: three in ten, which take time and are invisible. 0: none is pruned.
-        enough_views: number of training views above which Gaussians in only one view are pruned, without a background.
+        maximum_scale_share: largest scale of Gaussians within the scene's extent, as a share of the extent. Larger
+            Gaussians are pruned.
+        far_scale_share: largest scale of Gaussians beyond the extent, as a share of their distance. It is a little more
+            than the largest initial scale of distant Gaussians (``Initialization``).
+        large_from: share of all steps after which huge Gaussians are pruned. The release begins at 3,000 of 30,000
+            steps, which is the interval of its opacity resets.
+        large_minimum: first step at which huge Gaussians may be pruned.
+        pixels_each: least number of pixels of all training pictures for each Gaussian. A Gaussian has about sixty
+            parameters, and a pixel has three values. With fewer than twenty pixels for each Gaussian, there are more
+            unknowns than data.
+        faint_pixels: least sum of the blending weights that a Gaussian must reach in at least one training picture.
+            Fainter Gaussians are pruned at the end of the density control. About three in ten are fainter; they are
+            invisible and take time. 0 disables this step.
+        enough_views: number of training views from which on Gaussians in a single view are pruned, if the scene has no
+            background.
         reset_opacity: opacity after a reset (Kerbl et al. 2023).
-        free_share: free share of the depth of a view's nearest points (``gaussians.densify``).
-        free_quantile: quantile of the points' depths that counts as the nearest.
+        free_share: ``share`` of ``free_space``.
+        free_quantile: ``quantile`` of ``free_space``.
     """
 
     every: int = 100
@@ -102,16 +105,16 @@ class Densification:
     free_quantile: float = 0.02
 
     def prunes_large(self, step: int, steps: int) -> bool:
-        """Return True if the round after a step, of ``steps`` in all, prunes huge Gaussians."""
+        """Return True if the round after a step prunes huge Gaussians; ``steps`` is the number of all steps."""
         return step >= max(self.large_minimum, self.large_from * steps)
 
 
 class DensityStatistics:
-    """Sums of the screen-space gradient norms over the pictures in which each Gaussian was visible.
+    """Gradient statistics of each Gaussian, from which the density control decides.
 
-    With several views per step, each view of a step has its own sums, which are added in order for the mean. Processes
-    that share the views of a step therefore exchange sums only for the mean, and the result does not depend on the
-    number of processes.
+    The norms of the screen-space gradients are summed over the pictures in which the Gaussian was visible. With several
+    views per step, each slot of a step has its own sums. The sums are added in order only when the mean is computed.
+    The result therefore does not depend on the number of processes that share the views of a step.
 
     Args:
         count: number N of Gaussians.
@@ -119,7 +122,8 @@ class DensityStatistics:
         device: device of the Gaussians.
 
     Attributes:
-        gradient, seen: sums, [N], or [S, N] for more than one slot.
+        gradient: sums of the gradient norms, [N], or [S, N] for more than one slot.
+        seen: numbers of pictures in which each Gaussian was visible, in the same shape.
     """
 
     def __init__(self, count: int, slots: int = 1, device: torch.device | None = None) -> None:
@@ -129,7 +133,7 @@ class DensityStatistics:
 
     @classmethod
     def of(cls, gradient: Tensor, counts: Tensor) -> DensityStatistics:
-        """Return statistics with these sums."""
+        """Create statistics from existing sums."""
         statistics = cls(0, gradient.shape[0] if gradient.ndim == 2 else 1, gradient.device)
         statistics.gradient = gradient
         statistics.seen = counts
@@ -139,8 +143,8 @@ class DensityStatistics:
         """Add one picture.
 
         Args:
-            screen_gradient: [N, 2] per pixel; converted to units of half a picture.
-            radii: [N], 0 for invisible Gaussians.
+            screen_gradient: [N, 2] gradient per pixel, which is converted to units of half a picture.
+            radii: [N] radii in pixels; 0 for invisible Gaussians.
             width, height: size of the picture.
             slot: slot of the view.
         """
@@ -162,7 +166,7 @@ class DensityStatistics:
 
 
 def _in_order(sums: Tensor) -> Tensor:
-    """Add sums [S, N] in order; return [N] unchanged."""
+    """Add sums [S, N] in the order of the slots. Sums [N] are returned unchanged."""
     if sums.ndim == 1:
         return sums
     total = sums[0]
@@ -184,18 +188,21 @@ def densify(
     limit: int,
     generator: torch.Generator,
 ) -> None:
-    """Do one round: clone small Gaussians with a large gradient, split large ones, prune transparent and huge ones.
+    """Run one round of the density control.
+
+    Gaussians with a large gradient are cloned if they are small, and split if they are large. Transparent and huge
+    Gaussians are pruned.
 
     Args:
         gaussians: the Gaussians.
-        statistics: sums since the previous round; reset.
+        statistics: statistics since the previous round; they are reset.
         settings: thresholds.
         extent: the scene's extent (``scene_extent``).
         middle: [3], the cameras' mean position.
-        prune_large: prune huge Gaussians (``Densification.prunes_large``).
-        empty: space in which Gaussians are pruned.
+        prune_large: True to prune huge Gaussians (``Densification.prunes_large``).
+        empty: free space. Gaussians inside it are pruned.
         limit: largest number of Gaussians.
-        generator: draws the positions of the children.
+        generator: random generator for the positions of new Gaussians.
     """
     pulled = statistics.mean() >= settings.gradient
     wide = gaussians["log_scales"].exp().amax(dim=1) > settings.dense_share * extent
@@ -227,12 +234,15 @@ def densify(
 
 
 def _children(gaussians: Gaussians, split: Tensor, generator: torch.Generator) -> dict[str, Tensor]:
-    """Return two children for each split Gaussian: drawn from it, 1.6 times smaller."""
+    """Return two new Gaussians for each split Gaussian.
+
+    Their positions are drawn from the split Gaussian, and they are 1.6 times smaller.
+    """
     values = {
         name: gaussians[name].detach()[split].repeat(2, *[1] * (gaussians[name].ndim - 1))
         for name in gaussians.names
     }
-    # Drawn on the CPU: the children are the same on every device.
+    # Positions are drawn on the CPU, so that they are the same on every device.
     drawn = torch.randn(values["means"].shape, generator=generator).to(values["means"].device)
     offsets = drawn * values["log_scales"].exp()
     rotations = quaternions_to_rotations(values["quaternions"])

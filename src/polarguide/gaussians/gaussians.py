@@ -1,8 +1,8 @@
 """Gaussians in training: tensors with one entry per Gaussian, and the moments of Adam (Kingma and Ba 2015).
 
-Gaussians are removed, appended and overwritten only through the methods here, so that a tensor and its moments stay
-consistent. The kernel of Adam is torch's. ``torch.optim.Adam`` would load torch's compiler at its first use, which
-takes as long as loading torch, in every training; and its state belongs to tensors, which are replaced here.
+Gaussians are removed, appended and overwritten only by the methods of this module, so that a tensor and its moments
+stay consistent. Adam uses the kernel of torch, but not ``torch.optim.Adam``. That class loads torch's compiler at its
+first use, which takes as long as loading torch. Its state also belongs to tensor objects, which are replaced here.
 """
 
 from __future__ import annotations
@@ -17,20 +17,20 @@ from torch.optim.adam import adam
 from polarguide.core.errors import PolarguideError
 
 MOMENTS = ("step", "exp_avg", "exp_avg_sq")
-"""Names of a tensor's state: number of steps, and the means of its gradients and of their squares."""
+"""Names of the state of Adam for a tensor: number of steps, mean gradient, and mean squared gradient."""
 
 
 class Adam:
     """State and steps of Adam.
 
     Args:
-        rates: learning rate by name of the tensor; others are not trained.
-        betas: decay of both moments.
-        epsilon: addition to the root of the second moment.
+        rates: learning rate by name of the tensor. Tensors without a rate are not trained.
+        betas: decay rates of the first and the second moment.
+        epsilon: value that is added to the square root of the second moment.
 
-    Attributes:
-        rates, betas: as above; they may change between steps.
-        moments: tensors of ``MOMENTS`` by name of the tensor; empty before its first step.
+        Attributes:
+            rates, betas: current values of the arguments, which may change between steps.
+            moments: state of each tensor by the names in ``MOMENTS``; empty before the first step of the tensor.
     """
 
     def __init__(
@@ -43,7 +43,7 @@ class Adam:
 
     @torch.no_grad()
     def step(self, tensors: Mapping[str, Tensor]) -> None:
-        """Do one step of every trained tensor with a gradient, in place, and drop the gradients."""
+        """Update every trained tensor with a gradient in place, and drop the gradients."""
         for name, rate in self.rates.items():
             tensor = tensors[name]
             if tensor.grad is None:
@@ -89,13 +89,13 @@ CORE_SHAPES = {
     "sh_dc": (3,),
     "sh_rest": (15, 3),
 }
-"""Shape of one Gaussian's values for the tensors of every recipe; a shading model adds its own."""
+"""Shapes of the values of one Gaussian, for the tensors of every recipe. Shading models add further tensors."""
 ORIENTED_SHAPES = {"outward": (3,)}
-"""The direction from which training views see a Gaussian, for oriented recipes; not trained."""
+"""Shape of the direction from which training views see a Gaussian. Oriented recipes have this untrained tensor."""
 
 
 class Parameters(Protocol):
-    """Per-Gaussian tensors by name: those in training, or a frozen copy of them."""
+    """Per-Gaussian tensors by name: the tensors in training, or a frozen copy."""
 
     def __getitem__(self, name: str, /) -> Tensor: ...
     def get(self, name: str, /) -> Tensor | None:
@@ -114,7 +114,7 @@ class Trained:
     """
 
     kind = ""
-    """Prefix of the names in a checkpoint."""
+    """Prefix of the names of the tensors in a checkpoint."""
 
     def __init__(self, tensors: Mapping[str, Tensor], rates: Mapping[str, float]) -> None:
         self._tensors = {
@@ -147,11 +147,11 @@ class Trained:
             self._adam.rates[name] = rate
 
     def step(self) -> None:
-        """Do one Adam step of every tensor with a gradient, and drop the gradients."""
+        """Update every tensor with a gradient by one step of Adam, and drop the gradients."""
         self._adam.step(self._tensors)
 
     def state(self) -> dict[str, Tensor]:
-        """Return the tensors ``KIND.NAME``, and their moments ``exp_avg``, ``exp_avg_sq`` and ``step``."""
+        """Return all tensors and their moments, by the names that a checkpoint uses."""
         out = {f"{self.kind}.{name}": t.detach().contiguous() for name, t in self._tensors.items()}
         for name, moments in self._adam.moments.items():
             for key, value in moments.items():
@@ -160,7 +160,7 @@ class Trained:
 
     @classmethod
     def from_state(cls: type[Own], state: Mapping[str, Tensor], rates: Mapping[str, float]) -> Own:
-        """Return the tensors and moments of ``state``."""
+        """Create the object from the tensors and moments that ``state`` returned."""
         named = {tuple(key.split(".")): value for key, value in state.items()}
         loaded = cls({k[1]: value for k, value in named.items() if k[0] == cls.kind and len(k) == 2}, rates)
         for name in loaded._adam.rates:
@@ -180,7 +180,7 @@ class Gaussians(Trained):
     """Named per-Gaussian tensors with their Adam moments.
 
     Args:
-        tensors: those of ``CORE_SHAPES`` and others, all with the same first axis.
+        tensors: the tensors in ``CORE_SHAPES`` and any others, all with the same first axis.
         rates: learning rate by name; tensors without a rate are not trained.
     """
 
@@ -226,7 +226,7 @@ class Gaussians(Trained):
         return tuple(self._tensors)
 
     def only(self, mask: Tensor) -> dict[str, Tensor]:
-        """Return all tensors of the Gaussians of a mask [N], detached."""
+        """Return all tensors, restricted to the Gaussians of a mask [N], detached."""
         return {name: t.detach()[mask] for name, t in self._tensors.items()}
 
     def snapshot(self) -> dict[str, Tensor]:
@@ -239,8 +239,8 @@ class Gaussians(Trained):
 
         Args:
             name: name of the tensor.
-            values: values of all Gaussians, also if ``rows`` selects some.
-            rows: [N] bool, Gaussians whose values are replaced and whose moments are zeroed; None: all.
+            values: values of all Gaussians, even if ``rows`` selects only some.
+            rows: [N] bool, True for Gaussians whose values are replaced and whose moments are zeroed. None means all.
         """
         self._nonzero.pop(name, None)
         tensor = self._tensors[name]
@@ -254,17 +254,17 @@ class Gaussians(Trained):
         self._adam.change(name, zeroed)
 
     def keep(self, index: Tensor) -> None:
-        """Remove all Gaussians except those of ``index``, a mask or indices."""
+        """Remove all Gaussians except the ones that ``index``, a mask or a tensor of indices, selects."""
         self._replace({name: t.detach()[index] for name, t in self._tensors.items()}, lambda m: m[index])
 
     def append(self, gaussians: Mapping[str, Tensor]) -> None:
-        """Append Gaussians with values of all tensors and zero moments."""
+        """Append Gaussians, given the values of all tensors. Their moments are zero."""
         joined = {name: torch.cat((t.detach(), gaussians[name])) for name, t in self._tensors.items()}
         count = gaussians["means"].shape[0]
         self._replace(joined, lambda m: torch.cat((m, m.new_zeros(count, *m.shape[1:]))))
 
     def _replace(self, tensors: Mapping[str, Tensor], follow: Callable[[Tensor], Tensor]) -> None:
-        """Replace tensors; ``follow`` makes the same edit of a moment."""
+        """Replace tensors, and apply ``follow`` to their moments, which must make the same edit."""
         self._nonzero.clear()
         for name, values in tensors.items():
             self._tensors[name] = values.contiguous().requires_grad_()

@@ -14,7 +14,10 @@ from polarguide.core.native import fits
 from polarguide.geometry.vectors import dot, unit
 
 GRAZING = 0.35
-"""Cosine of the angle to the camera below which the outward side decides, not the camera."""
+"""Cosine of the angle between a normal and the direction to the camera.
+
+Below it, the sign of the normal depends on ``outward`` and not on the camera.
+"""
 
 
 def quaternions_to_rotations(quaternions: Tensor) -> Tensor:
@@ -95,20 +98,22 @@ class _Axes(torch.autograd.Function):
 def shortest_axis_normals(
     means: Tensor, quaternions: Tensor, log_scales: Tensor, center: Tensor, outward: Tensor | None = None
 ) -> Tensor:
-    """Return unit normals of flat Gaussians: the axis of the smallest scale, turned outward.
+    """Return the unit normals of flat Gaussians: the axes of their smallest scale, turned outward.
 
-    Without ``outward``, normals point toward the camera. That flips Gaussians just beyond a silhouette: they cancel
-    those just in front of it, and the blended normal leans to the camera. With ``outward``, they keep their side.
+    Without ``outward``, all normals point toward the camera. This flips the normals of Gaussians just behind a
+    silhouette. They then cancel normals in front of it, and the blended normal leans toward the camera. With
+    ``outward``, normals keep their side.
 
     Args:
         means: [N, 3] centers.
         quaternions: [N, 4] (w, x, y, z), any length.
         log_scales: [N, 3] logarithms of the scales.
         center: [3] camera center.
-        outward: [N, 3] direction from which each Gaussian is visible, which decides at grazing angles; zero: unknown.
+        outward: [N, 3] direction from which each Gaussian is visible. It determines the sign at grazing angles. A zero
+            vector means unknown.
 
-    Returns:
-        [N, 3] world axes, differentiable in the quaternions (Ye et al. 2024, Sec. 3.2).
+            Returns:
+                Normals [N, 3] in world axes, differentiable in the quaternions (Ye et al. 2024, Sec. 3.2).
     """
     center = center.detach().to(means).contiguous()
     if fits(means, quaternions, log_scales, outward):
@@ -118,7 +123,7 @@ def shortest_axis_normals(
 
 
 def mirrored_directions(means: Tensor, center: Tensor, normals: Tensor) -> Tensor:
-    """Return directions of the rays from the camera after reflection at each Gaussian, without gradients.
+    """Return the directions of rays from the camera after reflection at each Gaussian, without gradients.
 
     Args:
         means: [N, 3] centers.
@@ -126,7 +131,7 @@ def mirrored_directions(means: Tensor, center: Tensor, normals: Tensor) -> Tenso
         normals: [N, 3] unit.
 
     Returns:
-        [N, 3], unit; zero for a mean at the center.
+        Unit directions [N, 3]; zero for a Gaussian at the camera center.
     """
     means = means.detach()
     normals = normals.detach()

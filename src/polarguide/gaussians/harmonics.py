@@ -75,7 +75,7 @@ def sh_basis(directions: Tensor, degree: int) -> Tensor:
 
 
 def _directions(means: Tensor, center: Tensor) -> Tensor:
-    """Return unit vectors from the center to the means; zero, with gradient zero, for a mean at the center."""
+    """Return unit vectors from the center to the means. A mean at the center has a zero vector and no gradient."""
     offsets = means - center
     squared = offsets.square().sum(dim=-1, keepdim=True)
     return offsets * squared.masked_fill(squared <= 1e-24, torch.inf).rsqrt()
@@ -112,9 +112,10 @@ class _Harmonics(torch.autograd.Function):
 
 
 def evaluate_sh(means: Tensor, center: Tensor, dc: Tensor, rest: Tensor, degree: int) -> Tensor:
-    """Evaluate each Gaussian's color from a camera: ``sum_k basis_k(d) coefficient_k``, ``d`` from center to mean.
+    """Evaluate the color of each Gaussian as seen from a camera.
 
-    ``d`` has unit length, or is 0 for a Gaussian at the center. The offset 0.5 of 3DGS is not included.
+    The color is ``sum_k basis_k(d) coefficient_k``, with ``d`` the unit direction from the camera center to the
+    Gaussian. ``d`` is zero for a Gaussian at the center. The offset 0.5 of 3DGS is not added.
 
     Args:
         means: [N, 3] Gaussian centers.
@@ -124,7 +125,7 @@ def evaluate_sh(means: Tensor, center: Tensor, dc: Tensor, rest: Tensor, degree:
         degree: 0 to 3; coefficients beyond it count as zero and get a zero gradient.
 
     Returns:
-        [N, 3], differentiable in means (through the direction), dc and rest.
+        Colors [N, 3], differentiable in means (through the direction), dc and rest.
 
     Raises:
         ValueError: a shape or the degree differs.

@@ -1,4 +1,4 @@
-"""Initial Gaussians: at the SfM points, and on shells far around the capture, beyond the points."""
+"""Initial Gaussians: at the SfM points, and in a shell far around the capture for its surroundings."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from polarguide.gaussians.harmonics import SH_C0
 
 @dataclass(frozen=True)
 class Initialization:
-    """Initialization of a training beyond the SfM points.
+    """Settings of the initial Gaussians that are added to the SfM points.
 
     Attributes:
-        shell: Gaussians far around the capture, for surroundings that SfM does not triangulate. None are added inside:
-            random Gaussians among the cameras become haze in front of them.
-        shell_radii: distances of the nearest and the farthest from the median of the points, in units of the cameras'
-            distance. At this distance they have little parallax, like sky and horizon.
+        shell: number of Gaussians in a shell far around the capture, for surroundings that SfM does not triangulate. No
+            random Gaussians are added inside the shell, because they become haze in front of the cameras.
+        shell_radii: inner and outer radius of the shell around the median of the points, in units of the cameras'
+            distance. At these distances there is little parallax, as for sky and horizon.
         opacity: initial opacity of all Gaussians.
     """
 
@@ -30,12 +30,18 @@ class Initialization:
 
 
 def scene_extent(centers: Tensor) -> float:
-    """1.1 times the largest distance of a camera from the cameras' mean (Kerbl et al. 2023). centers: [V, 3]."""
+    """Return the extent of a scene: 1.1 times the largest distance of a camera from the cameras' mean.
+
+    The definition is from Kerbl et al. 2023.
+
+    Args:
+        centers: [V, 3] camera centers.
+    """
     return 1.1 * float((centers - centers.mean(dim=0)).norm(dim=1).max())
 
 
 def neighbor_distance(points: np.ndarray) -> np.ndarray:
-    """Root mean squared distance of each point [M, 3] to its three nearest neighbors, [M]."""
+    """Return the root mean squared distance [M] of each point [M, 3] to its three nearest neighbors."""
     neighbors = min(4, len(points))
     distance, _ = cKDTree(points).query(points, k=neighbors)
     distance = np.asarray(distance).reshape(len(points), -1)[:, 1:]
@@ -45,28 +51,30 @@ def neighbor_distance(points: np.ndarray) -> np.ndarray:
 
 
 def camera_reach(points: np.ndarray, cameras: np.ndarray) -> tuple[np.ndarray, float]:
-    """Return the median of the points [M, 3], and the 90 % quantile of the cameras' [V, 3] distances from it."""
+    """Return the median of the points [M, 3], and a distance from it that 90 % of the cameras [V, 3] do not exceed."""
     middle = np.median(points, axis=0)
     return middle, float(np.quantile(np.linalg.norm(cameras - middle, axis=1), 0.9))
 
 
 def stretch_steps(means: Tensor, before: Tensor, middle: Tensor, reach: float) -> None:
-    """Lengthen a step of the Gaussians beyond the cameras in proportion to their distance, in place.
+    """Lengthen the last update of Gaussians beyond the cameras in proportion to their distance, in place.
 
-    The step of a Gaussian then has the same size in a picture at any distance.
+    At any distance, the update then has the same size in a picture.
 
     Args:
-        means: [N, 3] positions after the step.
-        before: [N, 3] positions before it.
+        means: [N, 3] positions after the update.
+        before: [N, 3] positions before the update.
         middle: [3] median of the points.
-        reach: distance of the cameras from it.
+        reach: distance of the cameras from the median of the points.
     """
     factor = ((before - middle).norm(dim=1, keepdim=True) / reach).clamp(min=1)
     means.copy_(torch.where(factor > 1, torch.lerp(before, means, factor), means))
 
 
 def far_away(means: Tensor, points: Tensor, centers: Tensor, share: float = 1.0) -> Tensor:
-    """Return a mask [N] of positions [N, 3] beyond a share of the cameras' distance from the middle of the points.
+    """Return a mask [N], True for positions [N, 3] that are far from the median of the points.
+
+    The limit is ``share`` times the distance of the cameras.
 
     Args:
         means: [N, 3] positions.
@@ -81,7 +89,7 @@ def far_away(means: Tensor, points: Tensor, centers: Tensor, share: float = 1.0)
 def initial_parameters(
     points: Tensor, colors: Tensor, centers: Tensor, settings: Initialization, *, seed: int
 ) -> dict[str, Tensor]:
-    """Return the initial parameters.
+    """Return the parameters of the initial Gaussians.
 
     Args:
         points: [M, 3] SfM points.

@@ -1,9 +1,9 @@
 """PLY files of Gaussians in the format of the 3DGS release, which ordinary viewers open.
 
-One ``vertex`` per Gaussian, float32 binary little-endian: position, normal (zero in the release), spherical harmonics
-of the display color, opacity (logit), scales (log), rotation (w, x, y, z). These are 62 floats. Readers such as the
-SIBR viewer of the release assume records of this size for every header. Files with further fields are for readers that
-find fields by name.
+The file has one ``vertex`` per Gaussian, in binary little-endian float32. Its 62 fields are position, normal (zero in
+the release), spherical harmonics of the display color, opacity (logit), scales (logarithms) and rotation (w, x, y, z).
+Some programs, such as the SIBR viewer of the release, assume records of this size for every header. Files with
+additional fields are for programs that find fields by name.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from polarguide.geometry.vectors import spread_directions
 REST_COUNT = 15
 DIRECTIONS = 64
 TOGETHER = 8192
-"""Batch size of the fit in Gaussians: about 100 MB."""
+"""Batch size in Gaussians of the fit, which takes about 100 MB."""
 
 RELEASE_FIELDS = (
     *("x", "y", "z", "nx", "ny", "nz"),
@@ -39,7 +39,7 @@ RELEASE_FIELDS = (
     *(f"scale_{i}" for i in range(3)),
     *(f"rot_{i}" for i in range(4)),
 )
-"""Fields of the 3DGS release at degree 3, in order. ``f_rest`` is channel-major: all of red first."""
+"""Fields of the 3DGS release at degree 3, in order. The fields ``f_rest`` begin with all coefficients of red."""
 
 
 def write_ply(
@@ -64,9 +64,9 @@ def write_ply(
         opacity_logits: [N] or [N, 1].
         sh_dc, sh_rest: [N, 1, 3] and [N, 15, 3] harmonics of the display (sRGB-encoded) color minus 0.5.
         normals: [N, 3] world axes; zero, as in the release, if None.
-        extra: further floating-point tensors [N, ...] by name (letters, digits, underscores). A tensor [N] becomes the
-            field ``name``; one [N, ..., C] the fields ``name_0`` and so on, last axis slowest (channel-major, as
-            ``f_rest``). A header comment records its shape.
+        extra: additional floating-point tensors [N, ...] by name (letters, digits, underscores). A tensor [N] becomes
+            the field ``name``. A tensor [N, ..., C] becomes the fields ``name_0``, ``name_1`` and so on, with the last
+            axis varying slowest as in ``f_rest``. A header comment records its shape.
 
     Raises:
         ValueError: a shape, name or type is wrong.
@@ -113,7 +113,7 @@ def read_ply(path: str | Path) -> dict[str, Any]:
         without a comment is a tensor [N].
 
     Raises:
-        PolarguideError: not a PLY file, or one without the fields of the 3DGS release.
+        PolarguideError: the file is not a PLY file, or lacks fields of the 3DGS release.
     """
     element = _read_vertex(path)
     names = [p.name for p in element.properties]
@@ -159,20 +159,21 @@ def refit_sh(
     normals: Tensor,
     slope: Callable[[Tensor], Tensor] | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """Fit harmonics of degree 3 to the colors of Gaussians, ``color = 0.5 + sum``, by weighted least squares for each.
+    """Fit spherical harmonics of degree 3 to the colors of each Gaussian by weighted least squares.
 
-    The colors are sampled in evenly spread directions. The weight of a direction is the visible area of a flat
-    Gaussian: the absolute cosine to its normal.
+    The model is ``color = 0.5 + sum``, where the sum is over the harmonics. Colors are sampled in evenly spread
+    directions. The weight of a direction is the visible area of a flat Gaussian, which is the absolute cosine between
+    the direction and the normal.
 
     Args:
-        color_fn: maps some of the Gaussians and directions [K, 3] (unit, from the camera to the Gaussian, as in
-            harmonics) to colors [P, K, 3].
-        normals: [N, 3] unit.
-        slope: slope of the display curve at linear colors, which weights their errors as displayed; None: displayed
-            colors.
+        color_fn: function that returns the colors [P, K, 3] of P selected Gaussians in K directions. The directions [K,
+            3] are unit vectors from the camera to the Gaussian.
+        normals: [N, 3] unit normals.
+        slope: function that returns the slope of the display curve at linear colors. Errors of linear colors are
+            multiplied by it, so that they count as displayed. None if ``color_fn`` returns displayed colors.
 
     Returns:
-        dc [N, 1, 3] and rest [N, 15, 3] float32.
+        A tuple of the harmonics of degree 0, [N, 1, 3], and of degrees 1 to 3, [N, 15, 3], in float32.
 
     Raises:
         ValueError: ``color_fn`` returns another shape.
@@ -209,7 +210,7 @@ def _extra_fields(name: str, shape: tuple[int, ...]) -> list[str]:
 
 
 def _columns(tensor: Tensor) -> NDArray[np.float32]:
-    """Convert [N, ...] to a table [N, fields], last axis slowest."""
+    """Convert a tensor [N, ...] to a table [N, fields], with the last axis varying slowest."""
     table = tensor.detach().to("cpu", torch.float32)
     if table.ndim > 2:
         table = table.movedim(-1, 1)
@@ -217,7 +218,7 @@ def _columns(tensor: Tensor) -> NDArray[np.float32]:
 
 
 def _from_columns(table: Tensor, shape: tuple[int, ...]) -> Tensor:
-    """Convert a table of ``_columns`` to rows of ``shape``."""
+    """Convert a table of ``_columns`` back to a tensor [N, *shape]."""
     if len(shape) < 2:
         return table.reshape(-1, *shape)
     return table.reshape(-1, shape[-1], *shape[:-1]).movedim(1, -1).contiguous()

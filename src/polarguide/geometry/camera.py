@@ -1,7 +1,7 @@
 """Pinhole cameras with a pose.
 
-Axes are those of OpenCV (x right, y down, z forward), the pose is world-to-camera, ``x_cam = R x_world + t``, and the
-center of the top-left pixel is at (0.5, 0.5), as in COLMAP.
+Camera axes are the axes of OpenCV: x right, y down, z forward. A pose maps world to camera coordinates, ``x_cam = R
+    x_world + t``. The center of the top-left pixel is at (0.5, 0.5), as in COLMAP.
 """
 
 from __future__ import annotations
@@ -20,13 +20,16 @@ from polarguide.core.errors import PolarguideError
 from polarguide.geometry.vectors import unit, unit_array
 
 FARTHEST = 1e9
-"""Upper bound of coordinates and focal lengths, for a sufficient resolution in single precision."""
+"""Upper bound of coordinates and focal lengths, beyond which single precision is too coarse."""
 FARTHEST_CENTER = 1e4
-"""Maximum distance of the principal point from the picture's corner, in sides of the picture; crops have large ones."""
+"""Maximum distance of the principal point from the picture's corner, in units of the picture's longer side.
+
+Cropped pictures may have a distant principal point.
+"""
 SHORTEST_FOCAL = 1e-4
-"""Minimum focal length, in sides of the picture."""
+"""Minimum focal length, in units of the picture's longer side."""
 MOST_STRETCH = 100.0
-"""Maximum ratio of the two focal lengths; anamorphic lenses have 2."""
+"""Maximum ratio of the two focal lengths; anamorphic lenses have a ratio of 2."""
 LENS = (
     f"positive focal lengths, at most {MOST_STRETCH:g} times one another, and a principal point, at most "
     f"{FARTHEST_CENTER:g} sides of the picture away"
@@ -35,8 +38,14 @@ LENS = (
 
 
 def can_be_lens(size: ArrayLike, focal: ArrayLike, center: ArrayLike) -> bool:
-    """Return True if a lens can have these numbers in pixels, also in single precision; False for NaN."""
-    side = max(float(np.max(size)), 1.0)  # other checks refuse pictures without pixels
+    """Return True if the intrinsics are valid and also remain valid in single precision; False for NaN.
+
+    Args:
+        size: width and height in pixels.
+        focal: both focal lengths in pixels.
+        center: principal point in pixels.
+    """
+    side = max(float(np.max(size)), 1.0)  # other checks reject pictures without pixels
     lengths = np.asarray(focal, np.float64)
     places = np.abs(np.asarray(center, np.float64))
     sound = (lengths <= FARTHEST).all() and (places <= min(FARTHEST, FARTHEST_CENTER * side)).all()
@@ -52,7 +61,10 @@ def _pixel_rays(
     dtype: torch.dtype,
     device: torch.device,
 ) -> Tensor:
-    """Return the rays of intrinsics. They are cached, because views share them and each rendering reads them."""
+    """Return the rays through all pixel centers.
+
+    They are cached, because views share intrinsics and each rendering reads the rays.
+    """
     x, y = (
         (torch.arange(n, dtype=dtype, device=device) + 0.5 - c) / f
         for n, f, c in zip(size, focal, center, strict=True)
@@ -62,10 +74,11 @@ def _pixel_rays(
 
 
 class Pose(NamedTuple):
-    """Pose on one device, in one dtype.
+    """Pose of a camera as tensors on one device, in one dtype.
 
     Attributes:
-        rotation: world-to-camera, [3, 3]. translation: world-to-camera, [3].
+        rotation: world-to-camera rotation, [3, 3].
+        translation: world-to-camera translation, [3].
         center: camera center in the world, [3].
     """
 
@@ -174,12 +187,12 @@ class Camera:
         return vectors @ self.pose(vectors.dtype, vectors.device).rotation.T
 
     def scaled(self, factor: float, width: int, height: int) -> Camera:
-        """Return the camera of the same view with lengths in pixels multiplied by ``factor``, for a picture size."""
+        """Return a camera of the same view with another picture size; intrinsics are multiplied by ``factor``."""
         inner = {name: factor * getattr(self, name) for name in ("fx", "fy", "cx", "cy")}
         return replace(self, width=width, height=height, **inner)
 
     def extended(self, width: int, height: int) -> Camera:
-        """Return the camera of another picture size that shows this view centered and as large as possible."""
+        """Return a camera of another picture size that shows all of this view, centered and as large as possible."""
         factor = min(width / self.width, height / self.height)
         scaled = self.scaled(factor, width, height)
         return replace(
@@ -189,7 +202,10 @@ class Camera:
         )
 
     def downscaled(self, factor: int) -> Camera:
-        """Return the camera of the same view averaged over ``factor`` x ``factor`` pixels; remainders are cut off."""
+        """Return the camera of a picture that is averaged over squares of ``factor`` x ``factor`` pixels.
+
+        Pixels at the right and bottom that fill no square are cut off.
+        """
         inner = {name: getattr(self, name) / factor for name in ("fx", "fy", "cx", "cy")}
         return replace(self, width=self.width // factor, height=self.height // factor, **inner)
 
@@ -204,15 +220,15 @@ def _no_matrices(expected: str, found: str) -> PolarguideError:
 
 
 def seen_at(offsets: Tensor, camera: Camera) -> tuple[tuple[Tensor, Tensor], Tensor, Tensor]:
-    """Project points.
+    """Project points into a picture.
 
     Args:
-        offsets: [N, 3] from the camera's center to the points, world axes.
+        offsets: [N, 3] vectors from the camera center to the points, world axes.
         camera: the view.
 
     Returns:
-        The nearest pixel in the picture (row, column), each [N] int64; the depth [N]; and [N] bool, True if the point
-        lies in the picture.
+        A tuple of three items. The first is the nearest pixel of each point, as row and column, each [N] int64. The
+        second is the camera depth [N]. The third is a mask [N], True for points that lie in the picture.
     """
     x, y, z = camera.to_camera(offsets).unbind(-1)
     safe = z.clamp(min=1e-6)
@@ -231,7 +247,7 @@ def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike) -> tuple[Tensor, T
         up: [3] upward direction in the picture, not parallel to the optical axis.
 
     Returns:
-        World-to-camera rotation [3, 3] and translation [3], float64.
+        A tuple of the world-to-camera rotation [3, 3] and translation [3], float64.
     """
     center = np.asarray(eye, np.float64)
     forward = unit_array(np.asarray(target, np.float64) - center)

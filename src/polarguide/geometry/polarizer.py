@@ -1,6 +1,6 @@
-"""Linear polarizer of a camera: its four angles and Malus's law, for NumPy arrays and PyTorch tensors.
+"""Linear polarizers: the four standard angles and Malus's law, for NumPy arrays and PyTorch tensors.
 
-Angles are counter-clockwise as displayed, from the image's horizontal.
+Angles are measured from the image's horizontal, counter-clockwise in the displayed picture.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ def malus(stokes: Any, angle: Any) -> Any:
         angle: angle of the polarizer in radians: a number, or an array or tensor that broadcasts against [...].
 
     Returns:
-        [...], of the type of ``stokes``.
+        Intensity [...], of the same type as ``stokes``.
     """
     s0, s1, s2 = stokes
     twice = 2 * angle

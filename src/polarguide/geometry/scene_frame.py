@@ -15,19 +15,19 @@ from polarguide.geometry.vectors import unit
 _LEAST_SPREAD = 1e-4
 """Smallest eigenvalue of the least-squares system for which optical axes count as intersecting."""
 _LEAST_FAN = 0.03
-"""Minimum variance of the pictures' rows (unit vectors) within a level plane."""
+"""Minimum variance of the directions of picture rows within a level plane."""
 _MOST_ROLL = 0.2
-"""Maximum variance of the rows out of that plane, as a share of the variance within it."""
+"""Maximum variance of the directions of picture rows across the level plane, as a share of the variance within it."""
 
 
 @dataclass(frozen=True, eq=False)
 class SceneFrame:
-    """Frame in which cameras move around a scene.
+    """Frame of a scene for paths around it.
 
     Attributes:
         center: [3] float64, point at which the cameras look.
-        up: [3] float64, unit.
-        distance: median distance of the cameras from the center; world units, positive.
+        up: [3] float64, unit upward direction.
+        distance: median distance of the cameras from the center, in world units; positive.
     """
 
     center: Tensor
@@ -39,10 +39,10 @@ class SceneFrame:
         return torch.from_numpy(Rotation.from_rotvec(degrees * self.up.numpy(), degrees=True).as_matrix())
 
     def panorama_axes(self) -> Tensor:
-        """Return the axes of an upright panorama, [3, 3] float64: columns are right, up and back.
+        """Return the axes of an upright panorama, [3, 3] float64. The columns are right, up and back.
 
-        The middle of the panorama shows the most level world axis, projected onto the level plane. Ties go to the first
-        axis.
+        The middle of the panorama shows the world axis that is closest to level, projected onto the level plane. Ties
+        go to the first axis.
         """
         level = torch.zeros(3, dtype=torch.float64)
         level[int(self.up.abs().round(decimals=6).argmin())] = 1.0
@@ -54,9 +54,9 @@ def scene_frame(cameras: Sequence[Camera]) -> SceneFrame:
     """Estimate the frame of one or more cameras.
 
     The center is the point nearest to all optical axes (least squares). If the axes are parallel, as for a camera that
-    moves along a line, the center lies ahead of the cameras' mean by the size of their spread. Up is the direction
-    perpendicular to the pictures' rows (least squares), because people hold cameras level. If the rows do not determine
-    it, up is the mean of the pictures' upward directions.
+    moves sideways, the center lies in front of the mean camera position. Its distance from there is the spread of the
+    cameras. The upward direction is perpendicular to the rows of the pictures (least squares), because people hold
+    cameras level. If the rows do not determine it, it is the mean of the pictures' upward directions.
     """
     centers = torch.stack([camera.center for camera in cameras])
     forward = torch.stack([camera.rotation[2] for camera in cameras])
@@ -77,7 +77,7 @@ def scene_frame(cameras: Sequence[Camera]) -> SceneFrame:
 def _common_up(cameras: Sequence[Camera]) -> Tensor:
     """Return the unit upward direction [3] float64; see ``scene_frame``."""
     mean = -torch.stack([camera.rotation[1] for camera in cameras]).mean(dim=0)
-    if float(mean.norm()) < 0.05:  # no common direction: cameras on all sides, or rolled
+    if float(mean.norm()) < 0.05:  # the directions cancel, as for cameras on all sides or rolled cameras
         mean = -cameras[0].rotation[1]
     mean = mean / mean.norm()
     rows = torch.stack([camera.rotation[0] for camera in cameras])

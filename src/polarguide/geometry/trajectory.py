@@ -34,7 +34,7 @@ REMEDY = (
     "Specify orbit, spiral, turntable or interpolate, or a JSON file with cameras as described in "
     "docs/how-to/export.md."
 )
-"""Remedy of errors in camera paths."""
+"""Remedy for errors in camera paths."""
 Side = Annotated[int, Meta(ge=1, le=LARGEST_SIDE)]
 """Side of a picture in a file."""
 
@@ -49,14 +49,14 @@ def orbit(
 ) -> list[Camera]:
     """Return a path once around the scene at the cameras' median height and distance.
 
-    It starts on the side of the first camera and has the lens of this camera.
+    The path starts on the side of the first camera, and all its cameras have the lens of this camera.
 
     Args:
         cameras: cameras of the scene, at least one.
-        frames: number of pictures; the last one is a step before the first.
+        frames: number of pictures. The last picture is one step before the first.
         swing: amplitude of two vertical oscillations, as a share of the distance.
-        around: frame of the scene; None: the frame of the cameras.
-        distance: distance from the frame's center, at the same elevation; None: the distance of the cameras.
+        around: frame of the scene. With None, it is estimated from the cameras.
+        distance: distance from the frame's center, at the same elevation. None means the distance of the cameras.
     """
     around = around or scene_frame(cameras)
     ahead, side = _level_axes(around, cameras[0].center)
@@ -81,8 +81,8 @@ def orbit(
 def interpolated(cameras: Sequence[Camera], frames: int) -> list[Camera]:
     """Return a smooth path of ``frames`` cameras through given cameras, in their order.
 
-    Positions follow a cubic spline and rotations SciPy's ``RotationSpline``. A camera at the position of the previous
-    one is left out.
+    Positions follow a cubic spline, and rotations follow SciPy's ``RotationSpline``. A camera at the same position as
+    the previous camera is skipped.
     """
     keyframes = list(cameras[:1])
     for camera in cameras[1:]:
@@ -105,7 +105,7 @@ def interpolated(cameras: Sequence[Camera], frames: int) -> list[Camera]:
 
 
 def _level_axes(around: SceneFrame, begin: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the level direction from the center to ``begin`` [3], and the direction a quarter turn to its left."""
+    """Return the level direction from the center to ``begin`` [3], and that direction turned left by 90 degrees."""
     offset = begin - around.center
     level = offset - dot(offset, around.up) * around.up
     if float(level.norm()) < 1e-6 * around.distance:
@@ -144,7 +144,7 @@ class _PathRecord(msgspec.Struct):
 
 
 def read_path(path: Path) -> tuple[list[Camera], float]:
-    """Read the cameras of a file and its frames per second, by default 30.
+    """Read the cameras of a file and its frames per second, which are 30 by default.
 
     Raises:
         PolarguideError: the file does not exist, or differs from the format that the module describes.
@@ -155,7 +155,7 @@ def read_path(path: Path) -> tuple[list[Camera], float]:
 
 
 def _camera_of(record: _CameraRecord, where: str) -> Camera:
-    """Check a camera of a file; ``where`` names the file and the camera, with an open bracket."""
+    """Check and convert a camera of a file. ``where`` names the file and the camera in messages."""
     place = list(record.translation)
     rotation = torch.tensor(record.rotation, dtype=torch.float64).reshape(3, 3)
     is_orthogonal = torch.dist(rotation @ rotation.T, torch.eye(3, dtype=torch.float64)) < 1e-3

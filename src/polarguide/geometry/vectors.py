@@ -22,7 +22,7 @@ def dot(a: Tensor, b: Tensor) -> Tensor:
 
 
 def unit(vectors: Tensor, floor: float = 1e-6) -> Tensor:
-    """Divide vectors [..., 3] by their length, or by ``floor`` if they are shorter; zero stays zero."""
+    """Divide vectors [..., 3] by their length, or by ``floor`` if they are shorter than ``floor``; zero stays zero."""
     squared = dot(vectors, vectors)
     return vectors * torch.rsqrt(squared.clamp(min=floor * floor))[..., None]
 

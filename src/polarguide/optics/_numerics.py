@@ -1,8 +1,8 @@
-"""Common functions of this package: safe arithmetic, window means, argument checks, and NumPy arrays as arguments.
+"""Common functions of this package: safe arithmetic, window means, argument checks, and support of NumPy arrays.
 
-The safe functions have finite values and gradients at singular points of the plain operation, such as the angle of an
-unpolarized pixel or the azimuth of a normal that points to the camera. There the value is the limit, or zero without a
-limit, and the gradient is zero. So one pixel cannot spoil an optimization step.
+The safe functions have finite values and gradients at points where the plain operation is singular. Examples are the
+angle of an unpolarized pixel, and the azimuth of a normal that points to the camera. There the value is the limit, or
+zero if no limit exists, and the gradient is zero. A single pixel therefore cannot spoil an optimization step.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from polarguide.geometry.vectors import dot
 
 
 def safe_sqrt(x: Tensor) -> Tensor:
-    """Return the square root; value and gradient are zero for ``x <= 0``."""
+    """Return the square root. Value and gradient are zero for ``x <= 0``."""
     positive = x > 0
     root = torch.sqrt(torch.where(positive, x, torch.ones_like(x)))
     return torch.where(positive, root, torch.zeros_like(x))
@@ -29,7 +29,7 @@ def safe_sqrt(x: Tensor) -> Tensor:
 def safe_atan2(y: Tensor, x: Tensor) -> Tensor:
     """Return ``atan2(y, x)`` in radians; value and gradient are zero if both y and x are zero.
 
-    A number below the smallest normal floating-point number counts as zero.
+    Subnormal floating-point numbers are treated as zero.
     """
     y, x = torch.broadcast_tensors(y, x)
     size = torch.maximum(y.abs(), x.abs()).detach()
@@ -42,7 +42,7 @@ def safe_atan2(y: Tensor, x: Tensor) -> Tensor:
 
 
 def safe_normalize(vectors: Tensor) -> Tensor:
-    """Normalize vectors along the last axis; value and gradient are zero below a length of machine epsilon."""
+    """Normalize vectors along the last axis. Value and gradient are zero for vectors shorter than machine epsilon."""
     squared = dot(vectors, vectors)[..., None]
     live = squared > torch.finfo(vectors.dtype).eps ** 2
     inverse = torch.rsqrt(torch.where(live, squared, torch.ones_like(squared)))
@@ -50,7 +50,7 @@ def safe_normalize(vectors: Tensor) -> Tensor:
 
 
 def window_mean(planes: Tensor, window: int) -> Tensor:
-    """Return means over square windows of planes [K, H, W]; pixels of the border are repeated outside.
+    """Return means over square windows of planes [K, H, W]. Beyond the border, its pixels are repeated.
 
     Raises:
         ValueError: ``window`` is not a positive odd number.
@@ -72,7 +72,7 @@ def check_leading(tensor: Tensor, count: int, name: str) -> None:
 
 
 def check_refractive_index(refractive_index: float | Tensor) -> None:
-    """Raise ValueError unless a refractive index that is a number exceeds 1; tensors are not checked."""
+    """Raise ValueError if the refractive index is a number of 1 or less. Tensors are not checked."""
     if not isinstance(refractive_index, Tensor) and not refractive_index > 1.0:
         raise ValueError(f"refractive index: expected more than 1, found {refractive_index}")
 
@@ -81,10 +81,10 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 
 def for_arrays(function: F) -> F:
-    """Make a function on tensors accept NumPy arrays, for which it returns arrays.
+    """Make a function on tensors also accept NumPy arrays; it then returns arrays.
 
-    Integers become floats (float32 up to 16 bits, else float64), other floats become float32 or float64, Booleans are
-    unchanged. If any argument is a tensor, results are tensors.
+    Integers of up to 16 bits become float32, and other integers become float64. Floats become float32 or float64, and
+    Booleans do not change. If any argument is a tensor, results are tensors.
     """
 
     @functools.wraps(function)
@@ -100,14 +100,14 @@ def for_arrays(function: F) -> F:
 
 
 def _any(value: Any, kind: type) -> bool:
-    """Return True if a value, or a value in a tuple, has a type."""
+    """Return True if a value, or any value in a tuple, is an instance of ``kind``."""
     if isinstance(value, tuple):
         return any(_any(item, kind) for item in value)
     return isinstance(value, kind)
 
 
 def _converted(value: Any, convert: Callable[[Any], Any]) -> Any:
-    """Convert a value, or the values in a tuple, named or not."""
+    """Apply ``convert`` to a value, or to all values of a tuple or named tuple."""
     if not isinstance(value, tuple):
         return convert(value)
     items = [_converted(item, convert) for item in value]

@@ -1,8 +1,8 @@
-"""Directions relative to a view ray: the lens frame, and zenith and azimuth of normals in it.
+"""The lens frame of a view ray, and zenith and azimuth of normals in this frame.
 
 All vectors are in camera axes (OpenCV: x right, y down, z forward). ``rays`` are unit vectors from the camera into the
 scene and broadcast against the other arguments. Polarization angles are measured in the lens frame of a pixel. An ideal
-rotationally symmetric lens carries this frame from the optical axis to the ray of the pixel.
+lens with rotational symmetry carries this frame from the optical axis to the ray of the pixel.
 """
 
 from __future__ import annotations
@@ -16,10 +16,11 @@ from polarguide.optics._numerics import for_arrays, safe_atan2
 
 @for_arrays
 def lens_frame(rays: Tensor) -> tuple[Tensor, Tensor]:
-    """Return image right and image up, carried from the optical axis to each ray by the smallest rotation.
+    """Return the directions "right" and "up" of the image at each view ray.
 
-    ``x_ref``, ``up_ref`` and ``-ray`` form a right-handed orthonormal basis. On the axis they are (1, 0, 0)
-    and (0, -1, 0).
+    The smallest rotation from the optical axis to the ray carries both directions along. ``x_ref``, ``up_ref`` and
+    ``-ray`` form a right-handed orthonormal basis. On the optical axis, ``x_ref`` is (1, 0, 0) and ``up_ref`` is (0,
+    -1, 0).
 
     Args:
         rays: [..., 3] unit.
@@ -60,8 +61,9 @@ def zenith(normals: Tensor, rays: Tensor) -> Tensor:
         rays: [..., 3] unit.
 
     Returns:
-        [...] radians in [0, pi]; more than pi/2 if the normal faces away, 0 for a zero normal. The gradient is 0 if the
-        normal is parallel to the ray, where an arc cosine would have an infinite one.
+        [...] radians in [0, pi]. It is more than pi/2 if the normal faces away, and 0 for a zero normal. The gradient
+        is 0 if
+                the normal is parallel to the ray, while the gradient of an arc cosine would be infinite.
     """
     along = dot(normals, rays)
     across = torch.linalg.vector_norm(normals - along[..., None] * rays, dim=-1)
@@ -72,8 +74,8 @@ def zenith(normals: Tensor, rays: Tensor) -> Tensor:
 def normal_from_angles(zenith: Tensor, azimuth: Tensor, rays: Tensor) -> Tensor:
     """Return the unit normal with a zenith and an azimuth about the ray.
 
-    ``-cos(zenith) ray + sin(zenith) (cos(azimuth) x_ref + sin(azimuth) up_ref)``; it faces the camera for zeniths below
-    pi/2.
+    The normal is ``-cos(zenith) ray + sin(zenith) (cos(azimuth) x_ref + sin(azimuth) up_ref)``. It faces the camera if
+    the zenith is less than pi/2.
 
     Args:
         zenith, azimuth: [...] radians.

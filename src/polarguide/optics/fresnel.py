@@ -1,7 +1,7 @@
 """Fresnel's equations for a smooth dielectric, their inverses, and the equations for a smooth conductor.
 
-``zenith`` is the angle of incidence in radians, in [0, pi/2]; values outside are clamped. ``refractive_index`` is more
-than 1, a number or a tensor that broadcasts against the zenith.
+``zenith`` is the angle of incidence in radians, in [0, pi/2]. Values outside are clamped. ``refractive_index`` is more
+than 1. It is a number, or a tensor that broadcasts against the zenith.
 
 All equations are written in ``c = cos i`` and ``t = n cos r = sqrt(n^2 - sin^2 i)`` (Snell's law). In these variables
 they are quotients without a singular point between normal and grazing incidence. The textbook forms in ``i - r`` and
@@ -66,7 +66,7 @@ def reflectances_from_cosine(cosine: Tensor, refractive_index: float | Tensor = 
 def reflectances(zenith: Tensor, refractive_index: float | Tensor = 1.5) -> tuple[Tensor, Tensor]:
     """Return power reflectances perpendicular (s) and parallel (p) to the plane of incidence (Fresnel's equations).
 
-    ``((n - 1) / (n + 1))^2`` for both at normal incidence, 1 for both at grazing incidence.
+    ``((n - 1) / (n + 1))^2`` is the value of both at normal incidence. At grazing incidence both are 1.
 
     Args:
         zenith: [...] angle of incidence, radians.
@@ -105,12 +105,13 @@ def transmittances(zenith: Tensor, refractive_index: float | Tensor = 1.5) -> tu
 
 @for_arrays
 def dolp_slopes(cosine: Tensor, refractive_index: float | Tensor = 1.5) -> tuple[Tensor, Tensor]:
-    """Return the degrees of polarization of both lobes over ``sin^2(zenith)``, for the cosine of the zenith.
+    """Return the degrees of polarization of specular and diffuse light over ``sin^2(zenith)``.
 
     ``rho_s = (Rs - Rp) / (Rs + Rp) = sin^2(i) * 2 c t / (c^2 t^2 + sin^4 i)`` and ``rho_d = u / (2 - u)`` with
-    ``u = sin^2(i - r) = sin^2(i) * ((t - c) / n)^2``. Both vanish as ``sin^2`` at normal incidence, where the direction
-    of polarization is undefined. Without this factor they are smooth. A caller multiplies them by the components of the
-    projected normal, whose squares sum to ``sin^2``, and so avoids the undefined direction.
+    ``u = sin^2(i - r) = sin^2(i) * ((t - c) / n)^2``. Near normal incidence, both are proportional to ``sin^2``, and
+    the direction of polarization is undefined at normal incidence itself. Without the factor ``sin^2`` they are smooth.
+    Callers multiply them by products of the components of the projected normal, whose squares add up to ``sin^2``. They
+    thus avoid the undefined direction.
 
     Args:
         cosine: [...] cos(zenith); negative values count as grazing.
@@ -135,8 +136,8 @@ def dolp_slopes(cosine: Tensor, refractive_index: float | Tensor = 1.5) -> tuple
 def specular_dolp(zenith: Tensor, refractive_index: float | Tensor = 1.5) -> Tensor:
     """Return the degree of polarization of specularly reflected light, ``(Rs - Rp) / (Rs + Rp)``.
 
-    The incident light is unpolarized. The degree is 0 at normal and grazing incidence and 1 at Brewster's angle. The
-    field is perpendicular to the plane of incidence.
+    The incident light is assumed to be unpolarized. The degree is 0 at normal and grazing incidence, and 1 at
+    Brewster's angle. The electric field is perpendicular to the plane of incidence.
 
     Args:
         zenith: [...] radians.
@@ -155,8 +156,8 @@ def specular_dolp(zenith: Tensor, refractive_index: float | Tensor = 1.5) -> Ten
 def diffuse_dolp(zenith: Tensor, refractive_index: float | Tensor = 1.5) -> Tensor:
     """Return the degree of polarization of light from below the surface, ``(Tp - Ts) / (Tp + Ts)``.
 
-    The light is unpolarized inside. The degree grows from 0 at normal incidence to ``diffuse_dolp_limit`` at grazing
-    incidence. The field lies in the plane of incidence.
+    The light inside is assumed to be unpolarized. The degree grows from 0 at normal incidence to ``diffuse_dolp_limit``
+    at grazing incidence. The electric field lies in the plane of incidence.
 
     Args:
         zenith: [...] radians.
@@ -173,7 +174,9 @@ def diffuse_dolp(zenith: Tensor, refractive_index: float | Tensor = 1.5) -> Tens
 
 @for_arrays
 def brewster(refractive_index: float | Tensor = 1.5) -> Tensor:
-    """Return Brewster's angle ``atan(n)`` in radians, at which Rp = 0; a float64 scalar tensor for a number.
+    """Return Brewster's angle ``atan(n)`` in radians, at which Rp = 0.
+
+    If the refractive index is a number, the result is a float64 scalar tensor.
 
     Raises:
         ValueError: ``refractive_index`` is a number not above 1.
@@ -188,7 +191,7 @@ def brewster(refractive_index: float | Tensor = 1.5) -> Tensor:
 def diffuse_dolp_limit(refractive_index: float | Tensor = 1.5) -> float | Tensor:
     """Return the maximum degree of polarization of diffuse light, at grazing incidence: ``(n^2 - 1) / (n^2 + 1)``.
 
-    The result is a number for a number and a tensor for a tensor.
+    The result is a number or a tensor, like the refractive index.
 
     Raises:
         ValueError: ``refractive_index`` is a number not above 1.
@@ -200,16 +203,18 @@ def diffuse_dolp_limit(refractive_index: float | Tensor = 1.5) -> float | Tensor
 
 @for_arrays
 def diffuse_zenith(dolp: Tensor, refractive_index: float | Tensor = 1.5) -> Tensor:
-    """Return the zenith at which diffuse light has a degree of polarization: the exact inverse of ``diffuse_dolp``.
+    """Return the zenith at which diffuse light has a given degree of polarization d.
 
-    ``atan2(n sqrt(2d), n sqrt(1 - d) - sqrt(1 + d))``, from ``cos^2(i - r) = (1 - d) / (1 + d)`` and Snell's law.
+    This is the exact inverse of ``diffuse_dolp``: ``atan2(n sqrt(2d), n sqrt(1 - d) - sqrt(1 + d))``. It follows from
+    ``cos^2(i - r) = (1 - d) / (1 + d)`` and Snell's law.
 
     Args:
         dolp: [...]; clamped to [0, ``diffuse_dolp_limit(refractive_index)``].
         refractive_index: refractive index of the surface, more than 1.
 
     Returns:
-        [...] radians in [0, pi/2]. The gradient is 0 at d = 0, although it has no limit there.
+        [...] radians in [0, pi/2]. At d = 0 the gradient is set to 0, although it grows without limit toward this
+        point.
 
     Raises:
         ValueError: ``refractive_index`` is a number not above 1.
@@ -224,10 +229,10 @@ def diffuse_zenith(dolp: Tensor, refractive_index: float | Tensor = 1.5) -> Tens
 
 @for_arrays
 def specular_zeniths(dolp: Tensor, refractive_index: float | Tensor = 1.5) -> tuple[Tensor, Tensor]:
-    """Return the two zeniths at which specular light has a degree of polarization: inverses of ``specular_dolp``.
+    """Return the two zeniths at which specular light has a given degree of polarization d.
 
-    With ``q = tan i tan r`` Fresnel's equations give ``d = 2q / (1 + q^2)``, hence ``q = d / (1 + sqrt(1 - d^2))``
-    below Brewster's angle and its reciprocal above. Then ``x = sin^2 i`` solves ``(1 - q^2) x^2 + q^2 (n^2 + 1) x -
+    They are the inverses of ``specular_dolp``. With ``q = tan i tan r``, Fresnel's equations give ``d = 2q / (1 +
+    q^2)``. Hence q is ``d / (1 + sqrt(1 - d^2))`` below Brewster's angle, and the reciprocal of this value above it. Then ``x = sin^2 i`` solves ``(1 - q^2) x^2 + q^2 (n^2 + 1) x -
     q^2 n^2 = 0``. The roots are written with the square root in the denominator and computed as tangents, so that no
     digits cancel at q = 1 (Brewster's angle) and q = 0.
 
@@ -236,8 +241,10 @@ def specular_zeniths(dolp: Tensor, refractive_index: float | Tensor = 1.5) -> tu
         refractive_index: refractive index of the surface, more than 1.
 
     Returns:
-        (below, above) Brewster's angle, each [...] radians in [0, pi/2]; equal at d = 1. Gradients are 0 at d = 0
-        (below) and d = 1, although they have no limit there.
+        A tuple of the zenith below and the zenith above Brewster's angle, each [...] radians in [0, pi/2]. They are
+        equal
+                at d = 1. Gradients are set to 0 at d = 1, and for the zenith below also at d = 0, where they have no
+                limit.
 
     Raises:
         ValueError: ``refractive_index`` is a number not above 1.
@@ -254,9 +261,9 @@ def specular_zeniths(dolp: Tensor, refractive_index: float | Tensor = 1.5) -> tu
 
 
 LEAST_REFLECTANCE = 0.1
-"""Lower bound of reflectances at normal incidence for which ``conductor_index`` returns a conductor."""
+"""Lower bound to which ``conductor_index`` clamps reflectances."""
 LARGEST_REFLECTANCE = 0.985
-"""Upper bound of reflectances at normal incidence for which ``conductor_index`` returns a conductor."""
+"""Upper bound to which ``conductor_index`` clamps reflectances."""
 
 
 def _terms(cosine: Tensor, n: Tensor, k: Tensor) -> tuple[Tensor, ...]:
@@ -271,11 +278,13 @@ def _terms(cosine: Tensor, n: Tensor, k: Tensor) -> tuple[Tensor, ...]:
 
 @for_arrays
 def conductor_reflectances(cosine: Tensor, n: Tensor, k: Tensor) -> tuple[Tensor, Tensor]:
-    """Return power reflectances of a conductor for the cosine of the angle of incidence; see the module.
+    """Return power reflectances of a conductor for the cosine of the angle of incidence.
+
+    The module describes the equations.
 
     Args:
         cosine: [...] cos(zenith); values outside [0, 1] are clamped.
-        n, k: [...] real and imaginary part of the index, n > 0, k >= 0; a ``k`` of 0 is a dielectric.
+        n, k: [...] real and imaginary part of the index, n > 0, k >= 0. With ``k`` = 0 the material is a dielectric.
 
     Returns:
         (Rs, Rp), each [...] in [0, 1].
@@ -291,8 +300,8 @@ def conductor_reflectances(cosine: Tensor, n: Tensor, k: Tensor) -> tuple[Tensor
 def conductor_dolp_slope(cosine: Tensor, n: Tensor, k: Tensor) -> Tensor:
     """Return the degree of polarization of a conductor's reflection over ``sin^2(zenith)``.
 
-    ``(Rs - Rp) / (Rs + Rp) = sin^2(i) y / x`` with x and y defined in the module. It is smooth at normal incidence,
-    where the direction of polarization is undefined (compare ``dolp_slopes``).
+    ``(Rs - Rp) / (Rs + Rp) = sin^2(i) y / x`` with x and y as defined in the module. The quotient y / x is smooth at
+    normal incidence, where the direction of polarization is undefined (compare ``dolp_slopes``).
 
     Args:
         cosine: [...] cos(zenith); values outside [0, 1] are clamped.
@@ -307,10 +316,11 @@ def conductor_dolp_slope(cosine: Tensor, n: Tensor, k: Tensor) -> Tensor:
 
 @for_arrays
 def conductor_oblique_share(cosine: Tensor, n: Tensor, k: Tensor) -> Tensor:
-    """Return the share of polarization at 45 degrees to the plane of incidence after reflection at a conductor.
+    """Return the share of polarization at 45 degrees to the plane of incidence that a conductor preserves.
 
-    It is the ratio of U / S0 after and before the reflection of light with U alone, ``1 - 2 sin^4(i) / x`` with x
-    defined in the module, from ``2 Re(-rs rp*) / (|rs|^2 + |rp|^2)``. The rest becomes circular polarization.
+    For incident light that is polarized at 45 degrees, it is the ratio of U / S0 after and before the reflection. It
+    equals ``2 Re(-rs rp*) / (|rs|^2 + |rp|^2) = 1 - 2 sin^4(i) / x`` with x as defined in the module. The rest becomes
+    circular polarization.
 
     Args:
         cosine: [...] cos(zenith); values outside [0, 1] are clamped.
@@ -326,11 +336,11 @@ def conductor_oblique_share(cosine: Tensor, n: Tensor, k: Tensor) -> Tensor:
 
 @for_arrays
 def conductor_index(reflectance: Tensor) -> tuple[Tensor, Tensor]:
-    """Return an index (n, k) of a metal with a reflectance at normal incidence.
+    """Return a typical complex index (n, k) of a metal with a given reflectance r at normal incidence.
 
-    ``n = 2.1 - 1.9 r`` is a line through copper, gold, silver, aluminum, chromium, iron, nickel and titanium. For
-    this n, ``k^2 = ((n + 1)^2 r - (n - 1)^2) / (1 - r)`` gives r (Gulbrandsen 2014, Eq. 2). Degrees of polarization
-    have errors of 0.01 at 45 degrees, 0.08 at 60 degrees and 0.4 beyond 70 degrees.
+    ``n = 2.1 - 1.9 r`` is a line fitted to copper, gold, silver, aluminum, chromium, iron, nickel and titanium. For
+    this n, ``k^2 = ((n + 1)^2 r - (n - 1)^2) / (1 - r)`` gives the reflectance r (Gulbrandsen 2014, Eq. 2). The
+    resulting degrees of polarization have errors of 0.01 at 45 degrees, 0.08 at 60 degrees and 0.4 beyond 70 degrees.
 
     Args:
         reflectance: [...] at normal incidence, clamped to [0.1, 0.985].
@@ -345,7 +355,9 @@ def conductor_index(reflectance: Tensor) -> tuple[Tensor, Tensor]:
 
 @for_arrays
 def conductor(cosine: Tensor, reflectance: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the reflectance of a metal for unpolarized light, ``(Rs + Rp) / 2``, and its ``conductor_dolp_slope``.
+    """Return the reflectance of a metal for unpolarized light, and its ``conductor_dolp_slope``.
+
+    The reflectance is ``(Rs + Rp) / 2``.
 
     Args:
         cosine: [...] cos(zenith); values outside [0, 1] are clamped.

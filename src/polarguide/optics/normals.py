@@ -1,12 +1,13 @@
 """Normals from polarization: candidates, the choice among them, masks of reliable pixels, and color differences.
 
-The polarization of one pixel determines a surface normal ambiguously. The angle of polarization gives the azimuth up
-to half a turn, and up to a quarter turn because specular and diffuse light are polarized at right angles. Zenith and
+The polarization of one pixel leaves several possible surface normals. The angle of polarization determines the azimuth
+only up to half a turn. Specular and diffuse light are polarized at right angles, which adds an ambiguity of a quarter
+turn. Zenith and
 azimuth are relative to the view ray of the pixel (see ``frames``). All normals are in camera axes.
 
-A dielectric surface reflects light without changing its color, while light from below has the color of the body. So
-mostly diffuse light differs between the color channels of a pixel. The differences of polarization show the diffuse
-lobe alone, for any amount of specular light. This combines the two colors of Nayar, Fang and Boult 1997 ("Separation
+A dielectric surface reflects light without changing its color, while light from below the surface has the color of the
+body. Differences between the color channels of a pixel are therefore mostly diffuse light. Their polarization reveals
+the diffuse lobe alone, for any amount of specular light. This combines the two colors of Nayar, Fang and Boult 1997 ("Separation
 of reflection components using color and polarization") with the polarization of diffuse light. In a channel c of a
 pixel,
 
@@ -57,11 +58,11 @@ class PhysicalCandidates(NamedTuple):
     """Six normals that Fresnel's equations allow for a pixel of one pure lobe.
 
     Attributes:
-        normals: [..., 6, 3] unit, all facing the camera: two diffuse, two specular below Brewster's angle,
-            two specular above it; within each pair the azimuths are half a turn apart.
-        valid: [..., 6] bool: False for the diffuse pair if the degree of polarization exceeds the limit of diffuse
-            light, and for all six if S0 is not positive.
-        specular: [6] bool: True for candidates of the specular lobe.
+        normals: [..., 6, 3] unit normals that face the camera. They are three pairs: diffuse, specular below Brewster's
+            angle, and specular above it. The azimuths of a pair differ by half a turn.
+        valid: [..., 6] bool. The diffuse pair is False if the degree of polarization exceeds the limit of diffuse
+            light. All six are False if S0 is not positive.
+        specular: [6] bool, True for candidates of the specular lobe.
     """
 
     normals: Tensor
@@ -70,11 +71,11 @@ class PhysicalCandidates(NamedTuple):
 
 
 class Disambiguated(NamedTuple):
-    """Chosen candidates.
+    """Candidate normals that ``disambiguate`` has chosen.
 
     Attributes:
-        normal: [..., 3] unit.
-        choice: [...] int64, position among the candidates.
+        normal: [..., 3] unit normal.
+        choice: [...] int64 index of the normal among the candidates.
         cosine: [...] cosine between the chosen normal and the guide, in [-1, 1].
     """
 
@@ -87,8 +88,9 @@ class Disambiguated(NamedTuple):
 def paper_candidates(stokes: Tensor, rays: Tensor, refractive_index: float | Tensor = 1.5) -> Candidates:
     """Return four candidate normals as in PolarGuide-GSDR: n, -n, R n, -R n.
 
-    The azimuth of n is the angle of polarization, and its zenith is the diffuse zenith of the degree of polarization.
-    The closed form of this zenith in PolarGuide-GSDR has three misprints; corrected, it equals ``diffuse_zenith``.
+    The azimuth of n is the angle of polarization. Its zenith is the zenith at which diffuse light has the measured
+    degree of polarization. The formula of this zenith in PolarGuide-GSDR has three misprints. Without them, it equals
+    ``diffuse_zenith``.
     Two of the four candidates face away from the camera.
 
     Args:
@@ -113,9 +115,10 @@ def paper_candidates(stokes: Tensor, rays: Tensor, refractive_index: float | Ten
 def physical_candidates(
     stokes: Tensor, rays: Tensor, refractive_index: float | Tensor = 1.5
 ) -> PhysicalCandidates:
-    """Return six candidate normals that face the camera: the exact inverses of both lobes.
+    """Return the six normals that face the camera and explain the polarization by a single pure lobe.
 
-    Diffuse zenith at azimuth AoLP and AoLP + pi; the two specular zeniths at AoLP + pi/2 and AoLP - pi/2.
+    Two candidates have the diffuse zenith, at the azimuths AoLP and AoLP + pi. Four have one of the two specular
+    zeniths, at the azimuths AoLP + pi/2 and AoLP - pi/2.
 
     Args:
         stokes: [3, ...] of the luminance.
@@ -123,7 +126,7 @@ def physical_candidates(
         refractive_index: refractive index of the surface, more than 1: a number or [...].
 
     Returns:
-        PhysicalCandidates. Invalid candidates hold the clamped value.
+        PhysicalCandidates. Invalid candidates have the zenith of the nearest possible degree of polarization.
 
     Raises:
         ValueError: the first axis of ``stokes`` is not 3, or ``refractive_index`` is a number not above 1.
@@ -150,13 +153,13 @@ def disambiguate(
 ) -> Disambiguated:
     """Choose the candidate nearest to a guide normal (the cosine rule of PolarGuide-GSDR).
 
-    The score of a candidate is its cosine with the guide. With ``azimuth_weight`` w it becomes ``(1 - w s) cosine + w
-    s cos(difference of azimuths)``, with s the sine of the guide's zenith. A wrong refractive index or a mixture of
-    lobes shifts the zenith of a candidate but not its azimuth, so the azimuth is the more reliable evidence if the
-    guide has one. Invalid candidates are chosen only if all are invalid.
+    The score of a candidate is the cosine between the candidate and the guide. With ``azimuth_weight`` w, the score is
+    ``(1 - w s) cosine + w s cos(difference of azimuths)``, where s is the sine of the guide's zenith. A wrong
+    refractive index or a mixture of lobes changes the zenith of a candidate, but not its azimuth. The azimuth is
+    therefore more reliable, unless the guide points to the camera and has no azimuth. Invalid candidates are chosen only if all are invalid.
 
     Args:
-        candidates: candidates, or their normals [..., K, 3] in camera axes.
+        candidates: a record of candidates, or candidate normals [..., K, 3] in camera axes.
         guide: [..., 3] camera axes; only the direction matters. Detach it if it is trained.
         rays: [..., 3] unit camera rays; needed for ``azimuth_weight > 0``.
         azimuth_weight: in [0, 1].
@@ -165,7 +168,7 @@ def disambiguate(
         Disambiguated.
 
     Raises:
-        ValueError: ``azimuth_weight`` outside [0, 1], or positive without ``rays``.
+        ValueError: ``azimuth_weight`` is outside [0, 1], or it is positive and ``rays`` is missing.
     """
     if not 0.0 <= azimuth_weight <= 1.0:
         raise ValueError(f"azimuth_weight: expected a number in [0, 1], found {azimuth_weight}")
@@ -195,9 +198,9 @@ def disambiguate(
 def dolp_noise(stokes: Tensor, noise_sigma: float | Tensor) -> Tensor:
     """Return the standard deviation of the degree of polarization d for independent noise on the four intensities.
 
-    With standard deviation ``sigma`` per intensity, S1 and S2 have ``sqrt(2) sigma`` and S0 has ``sigma``. S0 is
-    uncorrelated with both. To first order d has ``sigma sqrt(2 + d^2) / S0``, which is ``sqrt(2) sigma / S0`` for
-    weakly polarized light. For unpolarized light the measured d has a Rayleigh distribution with this scale: its mean
+    If each intensity has the standard deviation ``sigma``, S1 and S2 have ``sqrt(2) sigma``, and S0 has ``sigma``. S0
+    is uncorrelated with S1 and S2. To first order, d has the standard deviation ``sigma sqrt(2 + d^2) / S0``, which is
+    ``sqrt(2) sigma / S0`` for weakly polarized light. For unpolarized light the measured d has a Rayleigh distribution with this scale: its mean
     is 1.25 scales, and 1.1 % of the pixels exceed 3 scales.
 
     Args:
@@ -218,9 +221,9 @@ def dolp_noise(stokes: Tensor, noise_sigma: float | Tensor) -> Tensor:
 def intensity_noise(intensities: Tensor, window: int = 15) -> Tensor:
     """Estimate the standard deviation of the noise of one of the four intensities from the pictures.
 
-    Four angles measure three unknowns: without noise ``I0 + I90 - I45 - I135`` is zero, and its variance is four
-    times the variance of the noise. It is taken about the mean over the window, so unequal gains of the angles do not
-    count as noise. Changes of the light between shots count as noise.
+    Four angles measure three unknowns, so ``I0 + I90 - I45 - I135`` is zero without noise. Its variance is four times
+    the variance of the noise. The variance is computed about the mean over the window, so that unequal gains of the
+    angles are not mistaken for noise. Changes of the light between shots count as noise.
 
     Args:
         intensities: [4, H, W], of one channel or of the mean over the colors.
@@ -251,7 +254,7 @@ def polarization_mask(
     snr: float = 3.0,
     saturated: Tensor | None = None,
 ) -> Tensor:
-    """Return a mask of pixels with a polarization that is strong and certain enough for a normal.
+    """Return a mask of pixels whose polarization is strong and certain enough to estimate a normal.
 
     Args:
         stokes: [3, ...] of the luminance.
@@ -275,14 +278,17 @@ def polarization_mask(
 
 
 class ChromaticNormals(NamedTuple):
-    """Normals from color differences, as angles.
+    """Normals from the polarization of color differences, as angles.
+
+    The slope is the slope of (S1, S2) over S0 among colors, see ``chromatic_normals``.
 
     Attributes:
-        zenith: [H, W] radians, at which the degree of polarization of the diffuse lobe equals the slope.
-        azimuth: [H, W] radians in (-pi/2, pi/2], up to half a turn.
-        certainty: [H, W] explained over unexplained polarization, a ratio of standard deviations; 0 without color.
-        decided: [H, W] bool, True if only diffuse light can explain the slope, see ``chromatic_normals``.
-        contrast: [H, W] standard deviation of S0 among the colors of the window, as a share of S0; 0 or more.
+        zenith: [H, W] zenith in radians. There, the degree of polarization of diffuse light equals the length of the
+            slope.
+        azimuth: [H, W] azimuth in radians in (-pi/2, pi/2]. It is ambiguous by half a turn.
+        certainty: [H, W] ratio of the standard deviations of explained and unexplained polarization; 0 without color.
+        decided: [H, W] bool, True if only diffuse light can explain the slope.
+        contrast: [H, W] standard deviation of S0 among the colors of the window, as a share of S0.
     """
 
     zenith: Tensor
@@ -304,18 +310,21 @@ def chromatic_normals(
 ) -> ChromaticNormals:
     """Estimate zenith and azimuth from the slope of (S1, S2) over S0 among the colors of a small window.
 
-    A colored reflection has a slope of ``rho_s`` times the opposite direction. The mean polarization distinguishes
-    both cases. If it points against the slope, the pixel has both lobes, and the lobe that differs between colors has
-    the weaker polarization: the diffuse lobe. If it points along the slope, the pixel can be one colored lobe of either
-    kind. It is decided only if its degree of polarization is small, as for diffuse light at most zeniths.
+    For diffuse color differences, the slope is ``rho_d`` times the direction of diffuse polarization. A colored
+    reflection has a slope of ``rho_s`` times the opposite direction. The mean polarization distinguishes both cases. If
+    it is opposite to the slope, the pixel contains both lobes. The lobe that differs between colors is then the more
+    weakly polarized lobe, which is the diffuse lobe. If the mean polarization is parallel to the slope, the pixel may
+    be a single colored lobe of either kind. Such a pixel is decided only if its degree of polarization is small, as
+    diffuse light has at most zeniths.
 
     Args:
         stokes: [3, H, W, C] with the colors last.
         refractive_index: refractive index of the surface, more than 1.
         window: odd side of the window in pixels; the surface should be flat over it.
-        minimum_certainty: lower bound of the certainty of a decided pixel.
-        minimum_contrast: lower bound of the standard deviation of S0 among the colors, as a share of S0.
-        pure_lobe_dolp: upper bound of the degree of polarization if the mean points along the slope.
+        minimum_certainty: least ``certainty`` of a decided pixel.
+        minimum_contrast: least ``contrast`` of a decided pixel.
+        pure_lobe_dolp: largest degree of polarization of a decided pixel whose mean polarization is parallel to the
+            slope.
 
     Returns:
         ChromaticNormals. A picture without color has no decided pixel.

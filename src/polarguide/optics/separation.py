@@ -1,7 +1,7 @@
 """Separation of specular and diffuse light, and prediction of the polarization of their sum.
 
-Both layers are in units of S0, twice the intensity in a photograph. The incident light is assumed to be unpolarized and
-the surface to be a smooth dielectric.
+Both layers are in units of S0, which is twice the intensity of a photograph. The incident light is assumed to be
+unpolarized. The surface is assumed to be a smooth dielectric.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ class Separation(NamedTuple):
     """Specular and diffuse layer of one picture.
 
     Attributes:
-        specular: [..., C] light reflected at the surface, units of S0.
-        diffuse: [..., C] light from below the surface, units of S0.
-        conditioned: [...] bool, True for pixels with reliable values; without the color axis.
+        specular: [..., C] light reflected at the surface, in units of S0.
+        diffuse: [..., C] light from below the surface, in units of S0.
+        conditioned: [...] bool, True for pixels with reliable values. It has no color axis.
     """
 
     specular: Tensor
@@ -32,7 +32,7 @@ class Separation(NamedTuple):
 
 
 def _components(normals: Tensor, rays: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the components of the unit normal toward the camera (cos(zenith)), image right and image up."""
+    """Return three components of the unit normal: toward the camera (cos(zenith)), image right, and image up."""
     unit = safe_normalize(normals)
     x_ref, up_ref = lens_frame(rays)
     return -dot(unit, rays), dot(unit, x_ref), dot(unit, up_ref)
@@ -47,12 +47,12 @@ def exact_separation(
     *,
     minimum_contrast: float = 0.05,
 ) -> Separation:
-    """Solve S1 and S2 for both layers, given the normal.
+    """Separate specular and diffuse light, given the normal, by solving for S0, S1 and S2.
 
-    Specular light is polarized perpendicular to the plane of incidence with degree rho_s, diffuse light in the plane
-    with degree rho_d (Fresnel's equations). With P the part of (S1, S2) along the perpendicular, ``P = rho_s specular
-    - rho_d diffuse`` and ``S0 = specular + diffuse``. So ``specular = (P + rho_d S0) / (rho_s + rho_d)``, limited to
-    [0, S0], separately for each color.
+    By Fresnel's equations, specular light is polarized perpendicular to the plane of incidence with degree rho_s.
+    Diffuse light is polarized in this plane with degree rho_d. Let P be the polarization perpendicular to the plane.
+    Then ``P = rho_s specular - rho_d diffuse`` and ``S0 = specular + diffuse``. The solution is ``specular = (P + rho_d
+    S0) / (rho_s + rho_d)``, clamped to [0, S0], for each color separately.
 
     Args:
         stokes: [3, ..., C] with the colors last.
@@ -60,7 +60,7 @@ def exact_separation(
         rays: [..., 3] unit camera rays.
         refractive_index: refractive index of the surface, more than 1: a number or [...].
         minimum_contrast: lower bound of ``rho_s + rho_d`` for well-conditioned pixels. The default excludes zeniths
-            below about 11 degrees at n = 1.5. A tenth of it is the lower bound of the divisor, which limits the
+            below about 11 degrees at n = 1.5. The divisor is clamped to at least a tenth of this bound, to limit the
             amplification of noise.
 
     Returns:
@@ -89,11 +89,12 @@ def exact_separation(
 
 @for_arrays
 def paper_separation(stokes: Tensor, zenith: Tensor, refractive_index: float | Tensor = 1.5) -> Separation:
-    """Return the reflection cue of PolarGuide-GSDR, averaged over the four polarizer angles.
+    """Separate specular and diffuse light as PolarGuide-GSDR does, averaged over the four polarizer angles.
 
-    Fresnel's equations divide the observed S0 into specular ``S0 R`` and diffuse ``S0 (1 - R) T``, with R and T the
-    means over s and p. The average over the polarizer angles does not change when the camera rolls. The cue is
-    coarse: the share of the specular layer depends on the zenith alone, and the sum of the layers is not S0.
+    The specular layer is ``S0 R``, and the diffuse layer is ``S0 (1 - R) T``. R and T are Fresnel's reflectance and
+    transmittance, averaged over s and p. The average over the polarizer angles does not change when the camera rolls.
+    This separation is coarse. The share of the specular layer depends only on the zenith, and the sum of the layers is
+    not S0.
 
     Args:
         stokes: [3, ..., C] with the colors last.
@@ -101,7 +102,7 @@ def paper_separation(stokes: Tensor, zenith: Tensor, refractive_index: float | T
         refractive_index: refractive index of the surface, more than 1: a number or [...].
 
     Returns:
-        Separation in units of S0, ``conditioned`` True everywhere.
+        Separation in units of S0. ``conditioned`` is True everywhere.
 
     Raises:
         ValueError: the first axis of ``stokes`` is not 3, or ``refractive_index`` is a number not above 1.
@@ -124,11 +125,11 @@ def paper_intensities(
     polarizer: float | Tensor,
     refractive_index: float | Tensor = 1.5,
 ) -> tuple[Tensor, Tensor]:
-    """Return intensities of both layers behind a polarizer by the reflection cue of PolarGuide-GSDR.
+    """Return the intensities of both layers behind a polarizer, as PolarGuide-GSDR defines them.
 
     The intensity of a layer is ``(Imax + Imin) / 2 + (Imax - Imin) / 2 * cos 2(polarizer - d)``. The specular layer has
-    ``Imax = S0 / 2 * Rs``, ``Imin = S0 / 2 * Rp`` and ``d = s_direction``. The diffuse layer has the remaining light
-    instead of S0, Tp and Ts instead of Rs and Rp, and d perpendicular to ``s_direction``. (PolarGuide-GSDR has
+    ``Imax = S0 / 2 * Rs``, ``Imin = S0 / 2 * Rp`` and ``d = s_direction``. The diffuse layer has the remaining light in
+    place of S0, and Tp and Ts in place of Rs and Rp. Its d is perpendicular to ``s_direction``. (PolarGuide-GSDR has
     ``cos 2 theta`` with the angle from the image's x axis, which changes when the camera rolls.) The mean over the four
     polarizer angles is half of ``paper_separation``.
 
@@ -164,9 +165,9 @@ def predicted_stokes(
     """Predict the measured Stokes vector of two layers on a surface with a known normal.
 
     ``S0 = specular + diffuse`` and ``(S1, S2) = (rho_s specular - rho_d diffuse) (cos, sin)(2 (azimuth + pi/2))``,
-    with both degrees of polarization from Fresnel's equations. It is the inverse of ``exact_separation``. Value and
-    gradient are smooth if the normal is parallel to the ray, without polarization. A zero normal has no polarization,
-    and a normal that faces away counts as grazing.
+    with both degrees of polarization from Fresnel's equations. It is the inverse of ``exact_separation``. If the normal
+    is parallel to the ray, there is no polarization, and value and gradient are smooth. A zero normal also gives no
+    polarization. A normal that faces away is treated as grazing.
 
     Args:
         specular, diffuse: [..., C] units of S0, the colors last.

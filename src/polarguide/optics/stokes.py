@@ -3,8 +3,9 @@
 A Stokes tensor has the three linear components (S0, S1, S2) on its **first** axis and any shape after it. All values
 are linear radiance. Angles are radians, zero along the image's horizontal, counter-clockwise as displayed.
 
-An analyzer transmits a field at an angle t in the lens frame of its pixel. It is represented by (cos 2t, sin 2t), and
-the intensity behind it is ``(S0 + S1 cos 2t + S2 sin 2t) / 2`` (Malus's law).
+An analyzer is a polarizer as one pixel sees it. It transmits the electric field at an angle t in the lens frame of the
+pixel, and is represented by (cos 2t, sin 2t). The intensity behind it is ``(S0 + S1 cos 2t + S2 sin 2t) / 2`` (Malus's
+law).
 """
 
 from __future__ import annotations
@@ -36,13 +37,14 @@ def stokes(intensities: Tensor) -> Tensor:
         [3, ...] Stokes vector, in the units of the intensities.
 
     Raises:
-        ValueError: the first axis does not have four entries, or other integers have no known full scale.
+        ValueError: the first axis does not have four entries, or the values are other integers, whose full scale is
+            unknown.
     """
     return _stokes(_of_full_scale(intensities))
 
 
 def _of_full_scale(intensities: Any) -> Any:
-    """Divide codes of 8 or 16 bits by full scale, in single precision; floats are unchanged.
+    """Divide integers of 8 or 16 bits by their full scale, in single precision. Floats do not change.
 
     Raises:
         ValueError: the values are other integers.
@@ -86,7 +88,8 @@ def dolp(stokes: Tensor) -> Tensor:
         stokes: [3, ...].
 
     Returns:
-        [...] in [0, 1]; noise above 1 is clamped. It is 0 if S0 <= 0. The gradient is 0 for unpolarized light.
+        [...] in [0, 1]. Larger values, which noise may cause, are clamped. It is 0 if S0 <= 0. The gradient is 0 for
+                unpolarized light.
     """
     check_leading(stokes, 3, "stokes")
     s0 = stokes[0]
@@ -103,7 +106,7 @@ def dolp(stokes: Tensor) -> Tensor:
 def aolp(stokes: Tensor) -> Tensor:
     """Return the angle of linear polarization, ``atan2(S2, S1) / 2``: the direction of the electric field.
 
-    Do not average or interpolate these angles: average Stokes vectors and compute the angle afterwards.
+    Do not average or interpolate these angles. Instead, average Stokes vectors and compute the angle afterwards.
 
     Args:
         stokes: [3, ...].
@@ -121,7 +124,9 @@ def aolp(stokes: Tensor) -> Tensor:
 
 @for_arrays
 def photograph(stokes: Tensor) -> Tensor:
-    """Return the picture without a polarizer on the scale of the four images: their mean, ``S0 / 2``.
+    """Return the picture that a camera would take without a polarizer, ``S0 / 2``.
+
+    This is the mean of the four images behind a polarizer.
 
     Args:
         stokes: [3, ...].
@@ -150,15 +155,15 @@ def luminance(stokes: Tensor) -> Tensor:
 
 
 Mount = Literal["sensor", "filter"]
-"""Place of the polarizer: on the sensor, or a sheet before the lens."""
+"""Place of the polarizer: on the sensor, or a filter in front of the lens."""
 
 
 @for_arrays
 def filter_analyzer(angle: float | Tensor, rays: Tensor) -> Tensor:
-    """Return the analyzer of a sheet polarizer before the lens.
+    """Return the analyzer of a filter (sheet polarizer) in front of the lens.
 
-    A sheet absorbs the field along its absorption axis a in the plane of the picture. It transmits the field
-    perpendicular to a and to the ray d, along ``d x a``. In the lens frame of a pixel at normalized image position
+    A filter absorbs the electric field along its absorption axis a, which is parallel to the picture. It transmits the
+    field perpendicular to a and to the ray d, along ``d x a``. In the lens frame of a pixel at normalized image position
     (x, y) its angle differs from the mounting angle by up to about ``x y / 2`` radians.
 
     Args:
@@ -183,10 +188,11 @@ def filter_analyzer(angle: float | Tensor, rays: Tensor) -> Tensor:
 
 @for_arrays
 def analyzer(angle: float | Tensor, rays: Tensor, mount: Mount = "sensor") -> Tensor:
-    """Return the analyzer of a polarizer at an angle: [2], or [2, ...] for a filter before the lens.
+    """Return the analyzer of a polarizer at an angle: [2], or [2, ...] for a filter in front of the lens.
 
     Args:
-        angle: radians, a number or a scalar tensor. rays: [..., 3] unit, camera axes.
+        angle: angle in radians, a number or a scalar tensor.
+        rays: [..., 3] unit directions from the camera, camera axes.
         mount: place of the polarizer.
     """
     if mount == "filter":
@@ -201,7 +207,7 @@ def fitted_stokes(intensities: Tensor, analyzers: Tensor) -> Tensor:
 
     Args:
         intensities: [K, ..., C] linear, of the same exposure, with the colors last.
-        analyzers: [K, 2], or [K, 2, ...] for each pixel; (0, 0) for a picture without a polarizer.
+        analyzers: [K, 2], or [K, 2, ...] if they depend on the pixel. A picture without a polarizer has (0, 0).
 
     Returns:
         [3, ..., C], in the units of the intensities.
@@ -240,23 +246,25 @@ class Uncertainty(NamedTuple):
 
 @for_arrays
 def polarization_uncertainty(stokes: Tensor, variances: Tensor) -> Uncertainty:
-    """Return standard deviations of DoLP and AoLP, and the debiased DoLP.
+    """Return the standard deviations of DoLP and AoLP, and the DoLP without the bias of noise.
 
-    Noise increases the DoLP: even unpolarized light has a positive measured one. The debiased DoLP is the modified
+    Noise increases the DoLP, so that the measured DoLP of unpolarized light is positive. The debiased DoLP is the modified
     asymptotic estimator ``d - b^2 (1 - exp(-d^2 / b^2)) / (2 d)`` with b the noise across the direction of polarization
     (Plaszczynski, Montier, Levrier and Tristram 2014, "A novel estimator of the polarization amplitude from normally
-    distributed Stokes parameters", MNRAS 439, 4048). It is unbiased for d of at least about 2 b. For unpolarized light
-    four fifths of the bias remain, so average Stokes vectors over regions instead.
+    distributed Stokes parameters", MNRAS 439, 4048). It is nearly unbiased if d is at least about 2 b. For unpolarized
+    light, four fifths of the bias remain. In this case, average Stokes vectors over regions instead.
 
     Args:
         stokes: [3, ...].
-        variances: independent variances [4, ...] of the four intensities in the order of ``ANGLES``, in squared units
-            of ``stokes``; or a shape that broadcasts to it.
+        variances: [4, ...] variances of the independent noise of the four intensities, in the order of ``ANGLES``. The
+            units are the squared units of ``stokes``. Shapes that broadcast to [4, ...] are accepted.
 
     Returns:
         Uncertainty to first order, which is accurate if the DoLP exceeds about three standard deviations. For
-        unpolarized light the AoLP has ``UNIFORM_SPREAD``, and the true spread of the DoLP is 0.66 of the returned
-        one.
+        unpolarized
+                light, the AoLP has ``UNIFORM_SPREAD``, and the true standard deviation of the DoLP is 0.66 times the
+                returned
+                value.
 
     Raises:
         ValueError: the first axis of ``stokes`` is not 3, or the first axis of ``variances`` is not 4.
@@ -270,7 +278,9 @@ def polarization_uncertainty(stokes: Tensor, variances: Tensor) -> Uncertainty:
 
 @for_arrays
 def fitted_uncertainty(stokes: Tensor, covariance: Tensor) -> Uncertainty:
-    """Return ``polarization_uncertainty`` of fitted Stokes vectors for their covariance.
+    """Return the uncertainty of DoLP and AoLP for fitted Stokes vectors with a known covariance.
+
+    The result is the same as in ``polarization_uncertainty``.
 
     Args:
         stokes: [3, ...].

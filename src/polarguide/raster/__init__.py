@@ -1,4 +1,4 @@
-"""Splatting of Gaussians with any channels: one interface, a reference implementation, and fast backends."""
+"""Rasterizers that splat Gaussians with any channels: an interface, a reference implementation, and fast backends."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ __all__ = [
 def choose_backend(
     name: DeviceName, *, local_rank: int = 0, say: Callable[[str], None] = lambda _: None
 ) -> Backend:
-    """Choose the backend of a device; ``auto`` is the GPU if the machine has one and gsplat is installed.
+    """Choose the backend of a device. ``auto`` selects the GPU if the machine has one and gsplat is installed.
 
     Args:
         name: value of ``--device``.
@@ -38,7 +38,7 @@ def choose_backend(
         say: receives messages for the user, such as the start of a compilation.
 
     Raises:
-        PolarguideError: CUDA is requested, and no GPU, gsplat or kernel is available.
+        PolarguideError: CUDA is requested, but the GPU, gsplat or its kernels are not available.
     """
     if name == "cpu" or (name == "auto" and not torch.cuda.is_available()):
         return Backend(torch.device("cpu"), rasterize_cpu)

@@ -24,7 +24,10 @@ from polarguide.raster.interface import (
 
 
 def native_rasterizer(camera: Camera, channels: int, statistic: ScreenStatistic | None) -> Any:
-    """Create a native rasterizer for one picture with ``channels`` channels, which orders the statistic's first."""
+    """Create a native rasterizer for one picture with ``channels`` channels.
+
+    It processes the channels of the statistic first.
+    """
     chosen = list(statistic.channels) if statistic else []
     permutation = chosen + [k for k in range(channels) if k not in chosen]
     return _native.Rasterizer(
@@ -99,7 +102,7 @@ def rasterize_cpu(
     statistic: ScreenStatistic | None = None,
     still: tuple[int, ...] = (),
 ) -> Rasterized:
-    """Splat Gaussians on the CPU in float32; see ``Rasterize``. The number of threads does not change a bit."""
+    """Splat Gaussians on the CPU in float32; see ``Rasterize``. Results do not depend on the number of threads."""
     check_shapes(splats, statistic, still)
     for name, tensor in splats._asdict().items():
         if tensor.dtype != torch.float32 or tensor.device.type != "cpu":

@@ -1,12 +1,12 @@
-"""CUDA backend: gsplat's projection, tiling and blending behind the interface. No other module uses gsplat.
+"""CUDA backend, which implements the interface by gsplat's projection, tiling and blending.
 
-``load_gsplat`` imports gsplat and compiles its kernels. The backend uses the part of the interface that versions 1.5.3
-and 1.6.0 share; ``load_gsplat`` and ``COMPILED`` handle their differences.
+No other module uses gsplat. ``load_gsplat`` imports gsplat and compiles its kernels. The backend supports versions
+1.5.3 and 1.6.0. ``load_gsplat`` and ``COMPILED`` handle their differences.
 
-The definition of gsplat differs from ``raster.interface`` as follows (see the table in docs/explanation/gpu.md).
-Alpha is at most 0.999 in 1.5.3 and 0.99 in 1.6.0. A pixel also ends at a transmittance of exactly 1e-4. The radius is
-the wider half side of the drawn box in whole pixels, at most 3.33 standard deviations. Exponentials are approximate.
-Inputs are not searched for NaN, because the process would wait for the device.
+Pictures of gsplat differ from the definition in ``raster.interface`` (see the table in docs/explanation/gpu.md). Alpha
+is at most 0.999 in 1.5.3 and 0.99 in 1.6.0. Blending also ends at a transmittance of exactly 1e-4. The radius is half
+of the longer side of the drawn box, in whole pixels, and at most 3.33 standard deviations. Exponentials are
+approximate. Inputs are not searched for NaN, because the process would wait for the device.
 """
 
 from __future__ import annotations
@@ -39,18 +39,21 @@ from polarguide.raster.interface import (
 TILE = 16
 """Side of a tile in pixels."""
 NOTICE_SECONDS = 5.0
-"""Seconds of loading after which the kernels are certainly compiled."""
+"""Seconds of loading after which the user is informed that kernels are being compiled."""
 COMPILED = (1, 2, 3, 4, 5, 8, 9, 16, 17, 32, 33)
-"""Numbers of channels up to 33 that both versions compile; 1.5.3 pads others, 1.6.0 refuses them."""
+"""Numbers of channels up to 33 that both versions support. Version 1.5.3 pads other numbers, and 1.6.0 rejects them."""
 
 
 class _Projected(NamedTuple):
     """Projected Gaussians of one picture, sorted into tiles.
 
     Attributes:
-        means2d: [1, N, 2] pixels. conics: [1, N, 3]. opacities: [1, N].
-        offsets: [1, rows, columns] first intersection of each tile. order: [intersections] Gaussians.
-        radii: [1, N, 2] pixels; 0 if culled.
+        means2d: [1, N, 2] projected centers in pixels.
+        conics: [1, N, 3] inverse covariances.
+        opacities: [1, N] opacities.
+        offsets: [1, rows, columns] index of the first intersection of each tile.
+        order: [intersections] index of the Gaussian of each intersection.
+        radii: [1, N, 2] radii in pixels; 0 for culled Gaussians.
     """
 
     means2d: Tensor
@@ -65,7 +68,10 @@ _views: WeakKeyDictionary[Camera, dict[torch.device, tuple[Tensor, Tensor]]] = W
 
 
 def _view(camera: Camera, device: torch.device) -> tuple[Tensor, Tensor]:
-    """Return [1, 4, 4] world-to-camera and [1, 3, 3] intrinsics on a device, which are cached for each camera."""
+    """Return the world-to-camera matrix [1, 4, 4] and the intrinsics [1, 3, 3] on a device.
+
+    Both are cached for each camera.
+    """
     by_device = _views.setdefault(camera, {})
     if device not in by_device:
         pose, intrinsics = (
@@ -83,8 +89,8 @@ def has_gsplat() -> bool:
 def load_gsplat(say: Callable[[str], None]) -> None:
     """Import gsplat and its kernels, which are compiled at the first import.
 
-    Both versions compile when ``gsplat.cuda._backend`` is first imported. Without a CUDA toolkit they set the kernels
-    to ``None``. A failed compilation raises any exception of the compiler's driver.
+    Both versions of gsplat compile their kernels when ``gsplat.cuda._backend`` is first imported. Without a CUDA
+    toolkit they set the kernels to ``None``. A failed compilation may raise exceptions of any type.
 
     Args:
         say: receives a message for the user when a compilation is in progress.
@@ -185,9 +191,9 @@ def _blend(projected: _Projected, features: Tensor, camera: Camera) -> tuple[Ten
 
 
 class _AlphaAlone(torch.autograd.Function):
-    """Alpha that was computed before; its gradient, if needed, is computed by blending a zero channel.
+    """Alpha of an earlier blend; its gradient is computed by blending a zero channel, if a loss needs it.
 
-    So a statistic over all channels costs nothing unless a loss depends on alpha.
+    A statistic over all channels therefore costs nothing unless a loss depends on alpha.
     """
 
     @staticmethod
@@ -220,12 +226,12 @@ class _AlphaAlone(torch.autograd.Function):
 def _blend_with_statistic(
     projected: _Projected, features: Tensor, camera: Camera, statistic: ScreenStatistic
 ) -> tuple[Tensor, Tensor]:
-    """Blend features, and let the backward pass fill the statistic.
+    """Blend features, and let the backward pass store the statistic.
 
-    gsplat's gradient of the projected means is a sum over all channels. Channels are blended independently of each
-    other. So a separate call blends the channels of the statistic with a copy of the projected means. The gradient of
-    the copy is exactly the statistic, and the sum of both gradients is the whole gradient. Alphas of each Gaussian and
-    pixel are evaluated twice, but only once if the statistic has all channels.
+    In gsplat, the gradient of the projected means is a sum over all channels. A separate call therefore blends the
+    channels of the statistic with a copy of the projected means. The gradient of the copy is the statistic. The sum of
+    both gradients is the whole gradient, because channels are blended independently. Alphas are evaluated twice, or
+    once if the statistic has all channels.
     """
     chosen = list(statistic.channels)
     others = [channel for channel in range(features.shape[1]) if channel not in chosen]

@@ -3,11 +3,11 @@
 ``rasterize(splats, camera)`` splats N Gaussians with D feature channels each into one picture. Its inputs are tensors.
 Base color, normal, strength and depth are channels like any other.
 
-All backends have the same definition, apart from the differences that their modules name. The covariance has an EWA
-projection (Zwicker et al. 2001; Kerbl et al. 2023, Eq. 5) with 0.1 px^2 added (there 0.3). Gaussians are blended front
-to back in order of camera depth; ties by index. Alpha is min(0.99, opacity * exp(-d^T conic d / 2)), and contributions
-with alpha < 1/255 are dropped. A pixel ends before the Gaussian that would reduce its transmittance below 1e-4. The
-background is 0.
+All backends compute the same picture, apart from differences that their modules list. Covariances are projected by EWA
+splatting (Zwicker et al. 2001; Kerbl et al. 2023, Eq. 5). 0.1 px^2 is added to them, while Kerbl et al. add 0.3.
+Gaussians are blended front to back in the order of their camera depth, and equal depths by index. Alpha is min(0.99,
+opacity * exp(-d^T conic d / 2)), and contributions with alpha < 1/255 are dropped. The blending of a pixel ends before
+the Gaussian that would reduce its transmittance below 1e-4. The background is 0.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ MINIMUM_ALPHA = 1.0 / 255.0
 MAXIMUM_ALPHA = 0.99
 """Upper bound of the alpha of one Gaussian."""
 MINIMUM_TRANSMITTANCE = 1e-4
-"""Transmittance at which a pixel ends."""
+"""Transmittance of a pixel below which blending ends."""
 JACOBIAN_MARGIN = 0.15
-"""Maximum distance from the picture at which the Jacobian is evaluated, as a share of the picture's size.
+"""Distance from the picture to which the points for the projection's Jacobian are clamped, as a share of its size.
 
-Farther outside, the affine approximation of the projection breaks down.
+The affine approximation of the projection fails farther outside.
 """
 
 
@@ -63,10 +63,10 @@ class Rasterized(NamedTuple):
     Attributes:
         features: [H, W, D], the blended channels.
         alpha: [H, W] in [0, 1], 1 - transmittance.
-        radii: [N] pixels, three standard deviations of the wider axis of each projected Gaussian; 0 if culled. The
-            modules of backends name differences.
-        still: [H, W, S] a second copy of the requested channels, with a gradient on the Gaussians' features alone.
-            None: not requested.
+        radii: [N] radii of the projected Gaussians in pixels, which are three standard deviations of the longer axis. 0
+            for culled Gaussians. The modules of backends list differences.
+        still: [H, W, S] second copy of the requested channels. Its gradient reaches only the features of Gaussians.
+            None if no channel was requested.
     """
 
     features: Tensor
@@ -77,14 +77,14 @@ class Rasterized(NamedTuple):
 
 @dataclass
 class ScreenStatistic:
-    """Gradient of the loss with respect to the projected means, through some channels alone.
+    """Gradient of the loss with respect to the projected means, limited to some channels.
 
-    Densification needs the positional gradient of the colors, without normals and strengths (Ye et al. 2024). The
-    backward pass of a ``rasterize`` call fills the statistic.
+    Densification needs the positional gradient of the colors, without the gradient of normals and strengths (Ye et al.
+    2024). The backward pass of ``rasterize`` stores it in this object.
 
     Attributes:
         channels: feature channels through which the gradient passes.
-        gradient: [N, 2] in loss per pixel after the backward pass, None before.
+        gradient: [N, 2] in loss per pixel after the backward pass. None before.
     """
 
     channels: tuple[int, ...]
@@ -97,8 +97,8 @@ class Rasterize(Protocol):
     Args:
         splats: the Gaussians.
         camera: the view.
-        statistic: statistic for the backward pass to fill.
-        still: channels of which the result has a second copy, see ``Rasterized``.
+        statistic: object in which the backward pass stores the gradient of the projected means.
+        still: channels for the second copy ``Rasterized.still``.
 
     Raises:
         PolarguideError: a shape does not fit, or a value is not finite. The CUDA backend does not check values, because
@@ -116,7 +116,7 @@ class Rasterize(Protocol):
 
 
 class Backend(NamedTuple):
-    """Device and the rasterizer that runs on it."""
+    """A device and the rasterizer that runs on it."""
 
     device: torch.device
     rasterize: Rasterize
@@ -152,7 +152,10 @@ def check_shapes(splats: Splats, statistic: ScreenStatistic | None, still: tuple
 
 
 def some_channels(values: Tensor, channels: Sequence[int]) -> Tensor:
-    """Return some channels of [..., D]: a slice if possible, and no index, which would be copied to the device."""
+    """Return selected channels of a tensor [..., D].
+
+    A slice is used if possible, because an index would be copied to the device.
+    """
     first = channels[0]
     end = first + len(channels)
     if list(channels) == list(range(first, end)):

@@ -1,10 +1,10 @@
-"""Pictures with smaller pixels than in the training.
+"""Smooth pictures at a higher magnification than in the training.
 
-The rasterizer blurs Gaussians by the size of a pixel (``BLUR`` in squared pixels), so a training makes them narrower.
-With smaller pixels the blur is smaller, and the same Gaussians look like needles with gaps between them. Such a
-picture is
-drawn with the blur of the training: the blur of the smallest pixel at the Gaussian in any training view. Mip-Splatting
-(Yu et al. 2024) limits Gaussians by the same pixel during the training.
+The rasterizer blurs Gaussians by about a pixel (``BLUR`` in squared pixels), and a training compensates for this by
+narrower Gaussians. In a picture with smaller pixels the blur is smaller, and the narrow Gaussians look like needles
+with gaps between them. Such a picture is therefore drawn with the blur of the training. For each Gaussian, this is the
+blur of its smallest pixel in any training view. Mip-Splatting (Yu et al. 2024) limits Gaussians by the same pixel
+during the training.
 """
 
 from __future__ import annotations
@@ -25,13 +25,14 @@ def _pixel_sizes(depth: Tensor, camera: Camera) -> Tensor:
 
 @torch.no_grad()
 def footprints(means: Tensor, cameras: Iterable[Camera]) -> Tensor:
-    """Return the side of the smallest pixel at each Gaussian, among the cameras that show its center.
+    """Return the side of the smallest training pixel at each Gaussian, among the cameras that show its center.
 
     Args:
-        means: [N, 3] world positions. cameras: cameras of the training views.
+        means: [N, 3] world positions.
+        cameras: cameras of the training views.
 
     Returns:
-        [N] in world units; 0 if no camera shows the Gaussian.
+        Sides [N] in world units; 0 if no camera shows the Gaussian.
     """
     smallest = torch.full_like(means[:, 0], torch.inf)
     for camera in cameras:
@@ -42,13 +43,15 @@ def footprints(means: Tensor, cameras: Iterable[Camera]) -> Tensor:
 
 
 def as_trained(splats: Splats, camera: Camera, footprints: Tensor) -> Splats:
-    """Add the blur of the training's pixels to Gaussians if the camera's pixels are smaller.
+    """Enlarge Gaussians by the blur of the training if the camera's pixels are smaller than the training pixels.
 
     Args:
-        splats: N Gaussians. camera: camera of the picture. footprints: [N] as returned by ``footprints``.
+        splats: N Gaussians.
+        camera: camera of the picture.
+        footprints: [N] result of ``footprints``.
 
     Returns:
-        Gaussians with variances along all axes increased by the difference between both blurs.
+        Gaussians whose variances along all axes are increased by the difference between the two blurs.
     """
     pose = camera.pose(splats.means.dtype, splats.means.device)
     own = _pixel_sizes((splats.means - pose.center) @ pose.rotation[2], camera)

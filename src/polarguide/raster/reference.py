@@ -1,6 +1,7 @@
 """Reference implementation of the rasterizer in plain PyTorch, for any dtype and device.
 
-It evaluates each Gaussian at each pixel, so memory grows as N x H x W. It is meant for tests and tiny pictures.
+It evaluates each Gaussian at each pixel, so it needs memory in proportion to N x H x W. It is meant for tests with tiny
+pictures.
 """
 
 from __future__ import annotations
@@ -58,7 +59,7 @@ def rasterize_reference(
     statistic: ScreenStatistic | None = None,
     still: tuple[int, ...] = (),
 ) -> Rasterized:
-    """Splat Gaussians, differentiable by autograd, exact but slow; see ``Rasterize``."""
+    """Splat Gaussians exactly but slowly, differentiable by autograd; see ``Rasterize``."""
     check_shapes(splats, statistic, still)
     for name, tensor in splats._asdict().items():
         bad = (~torch.isfinite(tensor)).nonzero()
@@ -105,7 +106,7 @@ def rasterize_reference(
 
 
 def _with_statistic(image: Tensor, means2d: Tensor, statistic: ScreenStatistic) -> Tensor:
-    """Return the same picture; its gradient fills the statistic."""
+    """Return the same picture. Its backward pass stores the statistic."""
 
     def fill(gradient: Tensor) -> None:
         chosen = torch.zeros_like(gradient)

@@ -1,7 +1,7 @@
 """Surface of a splatted picture: position and normal around the median depth of each pixel.
 
-At an edge a pixel shows two surfaces. Its blended depth and normal lie between them. The means over Gaussians around
-the median depth belong to one of the surfaces.
+A pixel at an edge shows two surfaces, and its blended depth and normal lie between them. This module averages only the
+Gaussians around the median depth, which belong to one of the surfaces.
 
 ``alpha_in_front`` returns the share of a pixel in front of a given depth.
 """
@@ -25,8 +25,8 @@ class SurfacePicture(NamedTuple):
     """Surface around the median depth of each pixel.
 
     Attributes:
-        directions: [H, W, 3] mean of the Gaussians' directions, of at most unit length; zero without Gaussians.
-        depth: [H, W] mean of their camera depths; 0 without Gaussians.
+        directions: [H, W, 3] mean direction of the Gaussians, of at most unit length; zero without Gaussians.
+        depth: [H, W] mean camera depth of the Gaussians; 0 without Gaussians.
     """
 
     directions: Tensor
@@ -37,13 +37,15 @@ class SurfacePicture(NamedTuple):
 def surface_picture(splats: Splats, camera: Camera) -> SurfacePicture:
     """Return the weighted means of directions and camera depths around the median depth.
 
-    The median depth z_m of a pixel is the depth of the Gaussian at which the blended weights w_i, summed front to back,
-    reach half of their sum. The means have weights w_i exp(-(z_m / z_i - 1)^2 / (2 s^2)), s = ``WIDTH``.
+    The blending weights w_i of a pixel are summed front to back. The Gaussian at which the sum reaches half of its
+    final value has the median depth z_m. A Gaussian at depth z_i then has the weight w_i exp(-(z_m / z_i - 1)^2 / (2
+    s^2)) in both means, with s = ``WIDTH``.
 
-    Native kernels on the CPU compute it for Gaussians on any device. It serves outputs, not training.
+    Native kernels on the CPU compute the means for Gaussians on any device. They are used for output, not for training.
 
     Args:
-        splats: the Gaussians, float32; their features are directions [N, 3]. camera: the view.
+        splats: the Gaussians, float32. Their features are directions [N, 3].
+        camera: the view.
 
     Returns:
         Surface on the device of the Gaussians, without gradients.
@@ -62,27 +64,32 @@ def surface_picture(splats: Splats, camera: Camera) -> SurfacePicture:
 
 
 SLABS = 31
-"""Number of depths that one pass resolves. With the space behind them they fill the channels of a rasterizer."""
+"""Number of depths that one pass of ``alpha_in_front`` resolves.
+
+With one more channel for the space behind them, they use all channels of a rasterizer.
+"""
 PASSES = 4
-"""Number of passes."""
+"""Number of passes of ``alpha_in_front``."""
 
 
 @torch.no_grad()
 def alpha_in_front(splats: Splats, camera: Camera, depth: Tensor, rasterize: Rasterize) -> Tensor:
-    """Return the share of a pixel's blended weight from Gaussians with centers nearer than a depth.
+    """Return the share of each pixel's blending weights that belongs to Gaussians in front of a depth.
 
-    The median depth of a pixel is the depth at which this share is one half. The Gaussians are sorted into slabs of
-    depth, one channel each, so that a rasterizer returns the share at the ends of the slabs. A pixel is decided if the
+    At the median depth of a pixel, this share is one half. The Gaussians are sorted into slabs of depth with one
+    channel for each slab. A rasterizer then returns the share at the ends of the slabs. A pixel is finished if the
     shares at both ends of its slab lie on the same side of one half, or if its depth lies at an end. Each pass chooses
-    slabs by the depths of the remaining pixels. After the last pass the share of a remaining pixel is interpolated
-    linearly between the ends of its slab, which then is at most a few thousandths of its depth wide.
+    slabs by the depths of the unfinished pixels. After the last pass, the share of an unfinished pixel is interpolated
+    linearly between the ends of its slab. The slab is then at most a few thousandths of its depth wide.
 
     Args:
-        splats: the Gaussians; features are ignored. camera: the view.
-        depth: [H, W] camera depths; pixels with a depth of 0 or less are skipped. rasterize: rasterizer of the backend.
+        splats: the Gaussians; features are ignored.
+        camera: the view.
+        depth: [H, W] camera depths. Pixels with a depth of 0 or less are skipped.
+        rasterize: rasterizer of the backend.
 
     Returns:
-        [H, W] in [0, 1]; 0 without Gaussians and for skipped pixels.
+        Shares [H, W] in [0, 1]; 0 without Gaussians and for skipped pixels.
     """
     pose = camera.pose(splats.means.dtype, splats.means.device)
     places = ((splats.means - pose.center) @ pose.rotation[2])[:, None]

@@ -1,4 +1,4 @@
-"""Recipes by name: the methods that ``train`` offers, and their controls."""
+"""Recipes by name: the methods that ``train`` offers, and their controls without polarization."""
 
 from polarguide.recipes.registry import RECIPES, recipe_named
 

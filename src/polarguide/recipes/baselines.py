@@ -1,4 +1,4 @@
-"""The baselines on our Gaussians: 3DGS (Kerbl et al. 2023), 3DGS-DR (Ye et al. 2024) and Ref-GS (Zhang et al. 2025)."""
+"""Recipes of the baselines 3DGS (Kerbl et al. 2023), 3DGS-DR (Ye et al. 2024) and Ref-GS (Zhang et al. 2025)."""
 
 from __future__ import annotations
 
@@ -16,13 +16,16 @@ RATES = {
 }
 """Learning rates of every recipe: those of the 3DGS release, except for the geometry.
 
-The release has 30,000 steps. In some thousand steps, means and scales have to learn twice as fast and rotations ten
-times. The rate of the means is relative to the scene's extent, and falls to a tenth in place of a hundredth
-(``Recipe.means_decay``).
+The release trains for 30,000 steps. To converge in a few thousand steps, means and scales have twice its learning rates
+and rotations ten times. The rate of the means is relative to the scene's extent. It falls to a tenth
+(``Recipe.means_decay``), not to a hundredth as in the release.
 """
 
 RESET = Repeat("reset_opacity", fraction=0.1, minimum=700)
-"""Opacity reset: 3,000 of 30,000 steps in the release; short trainings need time to recover."""
+"""Reset of the opacities after every tenth of the steps, as in the release, but at least 700 steps apart.
+
+Short trainings need this time to recover.
+"""
 
 RECIPE_3DGS = Recipe(
     name="3dgs",
@@ -35,10 +38,11 @@ RECIPE_3DGS = Recipe(
 )
 
 PROPAGATION_DR = Rounds(("propagate_normals", "reset_opacity"), 1.5 / 61, minimum=350)
-"""Propagations and resets in turn.
+"""Normal propagations and opacity resets, which take turns.
 
-The release resets every 3,000 of 61,000 steps and propagates at the other thousands. Here one propagation lies in the
-middle between two resets, which remove again the opacity and width that it adds.
+The release resets opacities every 3,000 of 61,000 steps, and propagates normals at all other multiples of 1,000 steps.
+Here one propagation lies in the middle between two resets. A reset removes the opacity and width that a propagation
+adds.
 """
 RESET_DR = Repeat("reset_opacity", fraction=3 / 61, minimum=700)
 
@@ -56,7 +60,7 @@ RECIPE_3DGS_DR = Recipe(
     stages=(
         Stage("plain", 6 / 61, reflection=False, densify=True),
         Stage("propagate", 18 / 61, reflection=True, densify=True, rounds=PROPAGATION_DR),
-        # The last turn of the last round: unneeded Gaussians lose the opacity of the propagation.
+        # The last turn of the last round removes the opacity that the propagation has given to unneeded Gaussians.
         Stage(
             "densify",
             6 / 61,
@@ -79,7 +83,7 @@ RECIPE_REF_GS = Recipe(
     name="ref-gs",
     about="Deferred shading with a learned directional grid and an MLP: RGB alone.",
     stages=(
-        # No resets of the opacity, from which some thousand steps do not recover.
+        # Opacities are not reset, because a few thousand steps are too few to recover.
         Stage("densify", 0.5, reflection=True, weights=WEIGHTS, densify=True),
         Stage("refine", 0.5, reflection=True, weights=WEIGHTS),
     ),

@@ -1,7 +1,7 @@
-"""Recipes of polarguide: PolarGuide-GSDR's three stages (Shan et al. 2026), literally and with repaired physics.
+"""Recipes with the three stages of PolarGuide-GSDR (Shan et al. 2026), literally and with corrected physics.
 
-Rates, first strength, environment and SH schedule are those of ``3dgs-dr``, so that a difference between the two is a
-difference of supervision.
+Rates, first strength, environment and SH schedule are the same as in ``3dgs-dr``. Differences between the results of
+both methods are therefore caused by the supervision.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from polarguide.training.recipe import Action, Priors, Recipe, Repeat, Stage, We
 REFRESH = Repeat("refresh_priors", fraction=0.1, minimum=250)
 
 BEHIND = (1.15, 1.5)
-"""Begin and end of the fading behind the subject, see ``Stage.behind``.
+"""Distances between which gradients fade behind the subject, see ``Stage.behind``.
 
-On ten rendered scenes, 95 to 100 % of the subject's pixels are nearer than the begin.
+On ten rendered scenes, 95 to 100 % of the subject's pixels are nearer than the first distance.
 """
 _PLAIN = Stage("plain", 0.1, reflection=False, densify=True)
 
@@ -31,7 +31,10 @@ def _stages(
     hold_normals: bool = True,
     behind: tuple[float, float] | None = BEHIND,
 ) -> tuple[Stage, ...]:
-    """Return the three stages of PolarGuide-GSDR; the guided one first with, then without density control."""
+    """Return the three stages of PolarGuide-GSDR.
+
+    The guided stage is split into a part with density control and a part without.
+    """
     enter: tuple[Action, ...] = ("refresh_priors",)
     orient: tuple[Action, ...] = ("orient_normals",) if oriented else ()
     return (
@@ -63,8 +66,8 @@ def _stages(
 
 _MEASURED = Weights(azimuth=0.15, chromatic=0.05)
 _GUIDED = replace(_MEASURED, flatness=0.3, consistency=0.1)
-# The final stage favors the picture: terms on measured normals stay, regularization of the geometry decreases, and
-# rotations slow down.
+# The final stage favors the picture. Terms on measured normals stay, regularization of the geometry becomes weaker, and
+# rotations learn more slowly.
 _FINAL = replace(_MEASURED, flatness=0.06, consistency=0.02)
 _SLOW = {"quaternions": 0.2}
 
@@ -133,12 +136,12 @@ _PAPER_DIFFUSE = 0.05
 
 
 def _paper_stages(guided: Weights, final: float, *, deferred_first: bool) -> tuple[Stage, ...]:
-    """Return the stages of 3DGS-DR with the terms of PolarGuide-GSDR in its second and third stage.
+    """Return the stages of 3DGS-DR, with the loss terms of PolarGuide-GSDR in the second and third stage.
 
     Args:
-        guided: weights between the first stage and the final one.
-        final: share of the steps of the final stage.
-        deferred_first: shade the first stage with deferred reflection as well.
+        guided: weights of the loss terms between the first and the final stage.
+        final: share of all steps that belong to the final stage.
+        deferred_first: True to shade the first stage with deferred reflection as well.
     """
     plain, propagate, densify, refine = RECIPE_3DGS_DR.stages
     return (

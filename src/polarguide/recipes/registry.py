@@ -1,10 +1,10 @@
-"""Recipes by name: the built-in ones, their controls, ablations, and those of installed plug-ins.
+"""Recipes by name: built-in recipes, their controls, ablations, and recipes of installed plug-ins.
 
 A control is a recipe without any polarization. Other ablations belong to ``polarguide_bench``.
 
-A plug-in is a package with entry points of the group ``polarguide.recipes``. Each names a ``Recipe``, a sequence of
-recipes, or a function without arguments that returns either. Plug-ins are loaded for a name that is not built in, never
-on import. A run's folder records the recipe's name, not the place of its code.
+A plug-in is a package with entry points of the group ``polarguide.recipes``. An entry point refers to a ``Recipe``, a
+sequence of recipes, or a function without arguments that returns one of these. Plug-ins are not loaded on import, but
+only when a name is not built in. A run folder records the name of the recipe, not the location of its code.
 """
 
 from __future__ import annotations
@@ -30,19 +30,24 @@ Change = Callable[[Recipe], Recipe]
 
 
 def varied(base: Recipe, *table: tuple[str, str, Change]) -> tuple[Recipe, ...]:
-    """Return the recipes ``base:name`` of a table with name, description, and change of ``base``."""
+    """Return the variations ``base:name`` of a recipe.
+
+    Args:
+        base: recipe to vary.
+        table: rows with the name, the description and the change of each variation.
+    """
     return tuple(
         replace(change(base), name=f"{base.name}:{name}", about=about) for name, about, change in table
     )
 
 
 def staged(change: Callable[[Stage], Stage]) -> Change:
-    """Return a change of every stage."""
+    """Return a change that applies ``change`` to every stage."""
     return lambda recipe: replace(recipe, stages=tuple(change(stage) for stage in recipe.stages))
 
 
 def weighing(change: Callable[[Weights], Weights]) -> Change:
-    """Return a change of the weights in every stage with polarization terms."""
+    """Return a change that replaces weights in every stage with polarization terms."""
     return staged(
         lambda stage: replace(stage, weights=change(stage.weights)) if stage.weights.priors else stage
     )
@@ -54,9 +59,9 @@ def off(*names: str) -> Change:
 
 
 def without(action: Action) -> Change:
-    """Return a change that removes an action.
+    """Return a change that removes an action from all stages.
 
-    Without refreshes, priors are computed once, when they are first needed.
+    Without the action that refreshes priors, they are computed once, when they are first needed.
     """
 
     def change(stage: Stage) -> Stage:
@@ -83,9 +88,9 @@ UNPOLARIZED = (
 GROUP = "polarguide.recipes"
 """Group of the entry points of plug-ins."""
 NEIGHBOR = "polarguide_bench.recipes"
-"""Module of the ablations."""
+"""Module that defines the ablations."""
 _ONLY_COMPARED = "gnerp"
-"""A recipe of a signed-distance field, and its ablations: ``polarguide_bench`` trains and scores them."""
+"""Name of a method based on a signed-distance field, which only ``polarguide_bench`` can train."""
 
 RECIPES: dict[str, Recipe] = {
     recipe.name: recipe
@@ -120,7 +125,7 @@ _BUILT_IN = {
 
 
 def recipe_named(name: str) -> Recipe:
-    """Return a recipe or a variation by name; ablations and plug-ins are loaded if it is not built in.
+    """Return a recipe or a variation by name. Ablations and plug-ins are loaded if the name is not built in.
 
     Raises:
         PolarguideError: the name is unknown or belongs to two plug-ins, or its plug-in cannot be loaded.
@@ -162,7 +167,9 @@ def recipe_named(name: str) -> Recipe:
 
 
 def recipe_names() -> list[str]:
-    """Return the names of all recipes that ``train`` takes: built-in ones, controls, ablations, and those of plug-ins.
+    """Return the names of all recipes that ``train`` accepts.
+
+    These are built-in recipes, controls, ablations, and recipes of plug-ins.
 
     Example:
         >>> polarguide.recipe_names()[:2]    # doctest: +SKIP
@@ -185,7 +192,11 @@ def _ablations() -> dict[str, Recipe]:
 
 
 def _plugins() -> tuple[dict[str, dict[str, Recipe]], dict[str, PolarguideError]]:
-    """Return recipes of plug-ins by name and by their entry points, and failures by the name of the entry point."""
+    """Load all plug-ins.
+
+    Returns a tuple of two mappings. The first has, for each name of a recipe, the recipes by entry point. The second
+    has the errors by the name of the entry point.
+    """
     offers: dict[str, dict[str, Recipe]] = {}
     failures: dict[str, PolarguideError] = {}
     for entry in entry_points(group=GROUP):
@@ -202,7 +213,7 @@ def _recipes_of(entry: EntryPoint) -> tuple[Recipe, ...]:
     """Return the recipes of an entry point.
 
     Raises:
-        PolarguideError: the entry point cannot be loaded, is no recipe, or has the name of a built-in one.
+        PolarguideError: the entry point cannot be loaded, returns no recipe, or has the name of a built-in recipe.
     """
     where = f"plug-in {entry.name} ({entry.value})"
     remedy = "Update or uninstall the package that brings it."

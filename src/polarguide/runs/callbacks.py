@@ -1,4 +1,4 @@
-"""Callbacks of a run for any method: progress with a log, checkpoints, viewer, memory and stop."""
+"""Callbacks of a run for any method: progress, log, checkpoints, viewer, memory limit, and end on request."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ from polarguide.training.losses import refuse_diverged
 from polarguide.training.settings import StepReport
 
 FOREIGN_SHARE = 0.10
-"""Share of one core above which other processes invalidate a measured time."""
+"""Load by other processes, as a share of one core, above which a measured time is invalid."""
 
 
 class Stopwatch:
-    """Wall time of an operation, with a check for other busy processes.
+    """Stopwatch for the wall time of an operation, which also detects other busy processes.
 
     Args:
-        seconds: earlier time, before a resume.
-        alone: no other process was busy then.
+        seconds: time that was measured before the operation was resumed.
+        alone: True if no other process was busy during that time.
     """
 
     def __init__(self, seconds: float = 0.0, alone: bool = True) -> None:
@@ -49,7 +49,7 @@ class Stopwatch:
         self._pause += time.perf_counter() - begin
 
     def read(self) -> tuple[float, bool]:
-        """Return the seconds so far, and True if no other process was busy."""
+        """Return a tuple of the elapsed seconds, and True if no other process was busy."""
         wall = time.perf_counter() - self._start
         foreign = (machine_busy_seconds() - self._machine) - (time.process_time() - self._own)
         alone = self._alone and foreign <= FOREIGN_SHARE * wall + 0.5
@@ -69,13 +69,13 @@ LOG_EVERY = 10
 SMOOTHING = 0.98
 """Weight of earlier steps in the displayed loss and PSNR."""
 Ends = Callable[[], bool]
-"""Returns True to end the training."""
+"""Function that returns True to end the training."""
 Look = Callable[[Ends], None]
-"""Runs between two steps, such as a viewer; its argument tells when the training should end."""
+"""Function that runs between two steps, such as a viewer. Its argument returns True when the training should end."""
 
 
 class TrainingStopped(KeyboardInterrupt):
-    """The training was stopped on request; its state is saved.
+    """Exception that ends a training on request, after its state was saved.
 
     Attributes:
         step: number of finished steps.
@@ -87,14 +87,14 @@ class TrainingStopped(KeyboardInterrupt):
 
 
 class Progress(Callback[Loop]):
-    """Progress with smoothed loss and PSNR, and the log with one of ten steps.
+    """Callback that shows progress with smoothed loss and PSNR, and logs every tenth step.
 
-    Reports are read in batches of ten, because reading waits for a GPU.
+    Reports are read in batches of ten, because reading waits for the GPU.
 
     Args:
-        advance: receives progress.
-        log: log of the run; None: not written by this rank.
-        stopwatch: time of the training.
+        advance: function that receives progress.
+        log: log of the run. None if this rank writes no log.
+        stopwatch: stopwatch of the training.
     """
 
     def __init__(self, advance: Advance, log: RunLog | None, stopwatch: Stopwatch) -> None:
@@ -129,10 +129,10 @@ class Progress(Callback[Loop]):
         )
 
     def read(self) -> tuple[float, float]:
-        """Read the collected reports; return the loss and the PSNR of the last.
+        """Read the collected reports, and return the loss and the PSNR of the last one.
 
         Raises:
-            PolarguideError: a loss that is not finite.
+            PolarguideError: a loss is not finite.
         """
         if not self._waiting:
             return math.nan, math.nan
@@ -157,13 +157,13 @@ class Progress(Callback[Loop]):
 
 @dataclass(eq=False)
 class Checkpoints(Callback[Loop]):
-    """Periodic checkpoints, written by rank 0.
+    """Callback that saves checkpoints at regular intervals; rank 0 writes them.
 
     Args:
         out: the run folder.
-        session: number of steps between two checkpoints, and their contents.
-        progress: read before a checkpoint, so that no state of a diverged training is saved.
-        stopwatch: paused during a checkpoint.
+        session: options with the number of steps between two checkpoints.
+        progress: callback whose reports are read before a checkpoint, so that a diverged state is not saved.
+        stopwatch: stopwatch of the training, which is paused during a checkpoint.
     """
 
     out: Path
@@ -183,7 +183,7 @@ class Checkpoints(Callback[Loop]):
         self.save(loop)
 
     def save(self, loop: Loop) -> None:
-        """Save the state with the sums of all ranks. Every rank calls it."""
+        """Save the state with the sums of all ranks. Every rank has to call it."""
         state = loop.saved_state()
         if loop.ranks.rank == 0:
             unfinished = state.step < loop.settings.steps
@@ -192,7 +192,7 @@ class Checkpoints(Callback[Loop]):
 
 @dataclass(eq=False)
 class Viewing(Callback[Loop]):
-    """Viewer between steps, while the stopwatch is paused."""
+    """Callback that runs a viewer between steps, while the stopwatch is paused."""
 
     look: Look
     should_stop: Ends
@@ -205,7 +205,7 @@ class Viewing(Callback[Loop]):
 
 @dataclass(eq=False)
 class MemoryLimit(Callback[Loop]):
-    """Return of freed memory to the system between steps."""
+    """Callback that returns freed memory to the system between steps."""
 
     memory: MemoryBound
 
@@ -215,7 +215,7 @@ class MemoryLimit(Callback[Loop]):
 
 @dataclass(eq=False)
 class Stop(Callback[Loop]):
-    """End of the training on request, after the same step on all ranks."""
+    """Callback that ends the training on request, after the same step on all ranks."""
 
     should_stop: Ends
 
@@ -233,12 +233,12 @@ class Stop(Callback[Loop]):
 
 @dataclass(eq=False)
 class ResourceReport(Callback[Loop]):
-    """Report of the time and the memory of a finished training.
+    """Callback that reports the time and the memory of a finished training.
 
     Args:
         reporter: receives the report.
-        stopwatch: time of the training.
-        planned: planned bytes of memory.
+        stopwatch: stopwatch of the training.
+        planned: planned memory in bytes.
     """
 
     reporter: Reporter
@@ -261,16 +261,16 @@ def run_to_the_end(
     look: Look | None,
     planned: int,
 ) -> None:
-    """Train to the end with progress, checkpoints and a log. Rank 0 alone writes.
+    """Train to the end with progress, checkpoints and a log. Only rank 0 writes files.
 
     Args:
-        loop: the loop. The callbacks of this module become its observers, before those that it has.
+        loop: the loop. The callbacks of this module are inserted before its existing observers.
         out: the run folder.
-        session: number of steps between two checkpoints.
+        session: options with the number of steps between two checkpoints.
         reporter: receives progress.
-        should_stop: returns True to end the training.
-        look: called between steps; None: no viewer.
-        planned: bytes of memory that the process may hold.
+        should_stop: function that returns True to end the training.
+        look: function that is called between steps, such as a viewer. None if there is none.
+        planned: memory in bytes that the process may use.
 
     Raises:
         TrainingStopped: ``should_stop`` returned True; the state is saved.

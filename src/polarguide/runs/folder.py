@@ -44,25 +44,25 @@ LOG = "log.jsonl"
 LOCK = ".lock"
 PLY = "point_cloud.ply"
 FOR_STEPS = {"adam", "frozen", "callback"}
-"""Parts of the names of tensors that only further steps read."""
+"""First parts of the names of tensors that are needed only to continue the training."""
 
 
 @dataclass(frozen=True)
 class RunConfiguration:
-    """The record that defines a run.
+    """Record that defines a run, stored in ``run.json``.
 
     Attributes:
-        scene: absolute path of the scene folder; ``IN_MEMORY`` for a scene of arrays.
-        scene_digest: hash of the scene's files, so that a run is not resumed with other data.
+        scene: absolute path of the scene folder, or ``IN_MEMORY`` for a scene that was created from arrays.
+        scene_digest: hash of the scene's files, which prevents a run from being resumed with other data.
         recipe: name of the recipe.
         recipe_data: all values of the recipe, for the record.
         settings: complete settings of the training.
-        downscale: side of the averaged pixel boxes.
-        transfer: transfer function of the files.
+        downscale: side in pixels of the squares that are averaged to one pixel.
+        transfer: transfer function of the picture files.
         device: device of the training.
-        test_views: the held-out views.
+        test_views: names of the held-out views.
         version: version of polarguide.
-        painted: digest of the painted materials of the training, see ``runs.painted``; None: no painted materials.
+        painted: hash of the painted materials of the training, see ``runs.painted``. None if there are none.
     """
 
     scene: Annotated[str, msgspec.Meta(min_length=1)]
@@ -110,7 +110,7 @@ class RunConfiguration:
         """Read ``run.json``.
 
         Raises:
-            PolarguideError: not a run folder, a run of another version, or a file that is no configuration.
+            PolarguideError: the folder is not a run, the run belongs to another version, or the file is invalid.
         """
         path = run / CONFIGURATION
         if not os.path.lexists(path):
@@ -136,7 +136,7 @@ class RunConfiguration:
 
 
 def _refuse_unknown(data: dict[str, Any], record: RunConfiguration, path: Path, remedy: str) -> None:
-    """Check that a record has no unknown fields, which could change the meaning of a run."""
+    """Check that a record has no unknown fields, because they could change the meaning of a run."""
     for place, values, of in (("", data, record), ("settings.", data["settings"], record.settings)):
         names = [field.name for field in dataclasses.fields(of)]
         for name in sorted(values.keys() - names):
@@ -146,26 +146,27 @@ def _refuse_unknown(data: dict[str, Any], record: RunConfiguration, path: Path, 
 
 @dataclass(frozen=True)
 class _Written:
-    """The fields of ``run.json`` that are read for every version."""
+    """Fields of ``run.json`` that are the same in every version."""
 
     version: str
 
 
 def _series(version: str) -> str:
-    """Return the series of versions that read each other's runs: 0.2 of 0.2.1."""
+    """Return the series of a version, such as 0.2 for 0.2.1. Versions of a series read each other's runs."""
     return ".".join(version.split(".")[:2])
 
 
 def save_checkpoint(run: Path, state: SavedState, *, optimizer: bool = True) -> None:
-    """Write the state atomically: after a kill, the old checkpoint or the new one is complete.
+    """Write the state atomically. If the process is killed, either the old or the new checkpoint is complete.
 
     Args:
         run: the run folder.
         state: state of the training.
-        optimizer: include Adam's moments, the frozen Gaussians and the tensors of callbacks, which only steps read.
+        optimizer: True to include data that only further steps need. These are the moments of Adam, the frozen
+            Gaussians and the tensors of callbacks.
 
     Raises:
-        PolarguideError: the checkpoint cannot be written; the old one remains.
+        PolarguideError: the checkpoint cannot be written. The old checkpoint remains.
     """
     tensors = state.tensors()
     if not optimizer:
@@ -179,7 +180,7 @@ def save_checkpoint(run: Path, state: SavedState, *, optimizer: bool = True) -> 
 
 
 def load_checkpoint(run: Path, recipe: Recipe, device: torch.device | str = "cpu") -> TrainingState:
-    """Read the state of a run to a device, for a training on any device.
+    """Read the state of a run to a device. The training may have run on another device.
 
     Raises:
         PolarguideError: the checkpoint is missing or damaged.
@@ -191,7 +192,9 @@ def load_checkpoint(run: Path, recipe: Recipe, device: torch.device | str = "cpu
 
 @contextlib.contextmanager
 def checkpoint_tensors(run: Path) -> Iterator[dict[str, Tensor]]:
-    """Yield the tensors of a run's checkpoint on the CPU; errors inside the context are reported as faults of the file.
+    """Yield the tensors of a run's checkpoint on the CPU.
+
+    Errors that are raised inside the context are reported as errors of the file.
 
     Raises:
         PolarguideError: the checkpoint is missing or damaged.
@@ -222,7 +225,7 @@ def checkpoint_tensors(run: Path) -> Iterator[dict[str, Tensor]]:
 
 @contextlib.contextmanager
 def writing_to(run: Path) -> Iterator[None]:
-    """Lock a run folder, which is created, against other writers; the lock ends with its process.
+    """Create a run folder, and lock it against other writers. The lock ends with the process.
 
     Raises:
         PolarguideError: another training writes to it.
@@ -266,13 +269,18 @@ class RunLog:
             file.write(json.dumps(values) + "\n")
 
     def cut(self, step: int) -> None:
-        """Remove lines from a step on, which a resumed training writes again, and foreign lines."""
+        """Remove the lines of ``step`` and later steps, and all lines that are not from polarguide.
+
+        A resumed training writes the removed lines again.
+        """
         if os.path.lexists(self._path):
             lines = [line for line, row in self._lines() if row["step"] < step]
             write_text(self._path, "".join(f"{line}\n" for line in lines))
 
     def rows(self) -> list[dict[str, Any]]:
-        """Return the complete lines of the log; a killed process may leave an incomplete one. Empty without a log.
+        """Return the complete lines of the log; empty without a log.
+
+        A killed process may leave an incomplete line, which is skipped.
 
         Raises:
             PolarguideError: the log cannot be read.
@@ -280,7 +288,7 @@ class RunLog:
         return [row for _, row in self._lines()]
 
     def _lines(self) -> list[tuple[str, dict[str, Any]]]:
-        """Return the lines of polarguide as text and as values."""
+        """Return the lines that polarguide wrote, each as a tuple of text and values."""
         if not os.path.lexists(self._path):
             return []
         rows = []
@@ -292,7 +300,7 @@ class RunLog:
         return rows
 
     def elapsed(self) -> tuple[float, bool]:
-        """Return the logged seconds of training, and True if no other process was busy."""
+        """Return a tuple of the logged seconds of training, and True if no other process was busy."""
         rows = self.rows()
         return (rows[-1]["seconds"], rows[-1]["alone"]) if rows else (0.0, True)
 
@@ -310,27 +318,33 @@ _ROWS = msgspec.json.Decoder(_Row)
 
 
 OPEN = ("steps", "refractive_index", "views_per_step", "background")
-"""Settings that may be unspecified, besides the number of Gaussians, which limits memory before pictures are read."""
+"""Settings that ``resolve`` completes if they are not specified.
+
+The number of Gaussians is not listed, because it is needed before pictures are read.
+"""
 VISITS = 60
 """Least number of visits to each training view."""
 LARGE = 1_000_000
-"""Pixels of a view above which the number of steps doubles: finer detail takes more rounds of the density control."""
-MOST_GAUSSIANS = 400_000
-"""Upper limit of the default number of Gaussians, for the memory of large captures.
+"""Number of pixels of a view above which the number of steps doubles.
 
-Trained scenes of 256 x 192 have 150,000. More Gaussians at full size were not studied.
+Finer detail takes more rounds of the density control.
+"""
+MOST_GAUSSIANS = 400_000
+"""Upper bound of the default number of Gaussians, which limits the memory for large captures.
+
+Scenes with pictures of 256 x 192 have 150,000 Gaussians. Larger numbers at full size were not studied.
 """
 
 
 def most_gaussians(
     pixels: int, method: Recipe, settings: TrainSettings, resumed: ResolvedSettings | None = None
 ) -> int:
-    """Return the largest number of Gaussians for a number of pixels.
+    """Return the largest number of Gaussians of a training.
 
     Args:
-        pixels: pixels of the training views.
+        pixels: number of pixels of all training views.
         method: the recipe.
-        settings, resumed: see ``resolve``.
+        settings, resumed: arguments of ``resolve``.
     """
     if settings.gaussians is not None:
         return settings.gaussians
@@ -349,9 +363,9 @@ def resolve(
     """Return the complete settings of a training.
 
     Args:
-        settings: specified settings.
-        scene, method: those of the training.
-        resumed: settings of the resumed run, which take precedence over those of the scene and its size.
+        settings: settings that the user specified.
+        scene, method: scene and recipe of the training.
+        resumed: settings of the run to resume. They take precedence over defaults that depend on the scene.
         processes: number of processes that share the views of a step.
 
     Raises:

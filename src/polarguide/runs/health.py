@@ -1,8 +1,8 @@
 """Health and reports of a finished training, as callbacks at its end.
 
-A training can end normally with an unusable result. Each fact in ``health.json`` describes one such fault. It has a
-limit with a meaning in ``Limits``, and leads to a warning that names views and a remedy. All facts come from training
-views alone. The reports cover polarizer angles and metals.
+A training can end normally although its result is unusable. Each value in ``health.json`` measures one possible fault.
+If a value exceeds its limit in ``Limits``, a warning names the views and a remedy. All values come from training views
+alone. The reports at the end cover polarizer angles and metals.
 """
 
 from __future__ import annotations
@@ -51,14 +51,18 @@ Count = Annotated[int, msgspec.Meta(ge=0)]
 
 @dataclass(frozen=True)
 class PolarizationSupport:
-    """Numbers of training views by the evidence of polarization behind their layers and normals.
+    """Numbers of training views by the quality of their polarization data.
+
+    They tell how far layers and normals of a run are based on measured polarization.
 
     Attributes:
-        measured: views whose pictures determine the Stokes vector of every pixel.
-        fitted: views with polarized pictures at too few angles for that, to which the model was fitted.
-        none: views without polarization for the recipe; their layers and normals are a guess of the model.
-        pictures: judged pictures of the fitted views.
-        doubtful: judged pictures with a doubtful angle.
+        measured: number of views whose pictures determine the Stokes vector of every pixel.
+        fitted: number of views with pictures at too few polarizer angles to determine it. The model was fitted to these
+            pictures.
+        none: number of views without polarization that the recipe uses. Their layers and normals are a guess of the
+            model.
+        pictures: number of pictures in the fitted views whose angle was judged.
+        doubtful: number of these pictures whose angle is doubtful.
     """
 
     measured: Count
@@ -76,8 +80,8 @@ class PolarizationSupport:
         Args:
             views: training views with the exposures that the training assumed.
             judgments: judgments of the training on their pictures.
-            measured: the recipe reads the polarization of views that determine the Stokes vector.
-            fitted: the recipe reads the polarization of other views.
+            measured: True if the recipe reads the polarization of views that determine the Stokes vector.
+            fitted: True if the recipe reads the polarization of other views.
         """
         determined = {view.name for view in views if view.is_determined}
         single = [
@@ -92,13 +96,13 @@ class PolarizationSupport:
 
     @property
     def word(self) -> Word:
-        """Evidence of most training views; the weaker one in a tie."""
+        """Quality of polarization data that most training views have. Ties go to the lower quality."""
         counts: dict[Word, int] = {"none": self.none, "fitted": self.fitted, "measured": self.measured}
         return max(counts, key=lambda word: counts[word])
 
     @property
     def text(self) -> str:
-        """Evidence of most training views, with the numbers of other views and of doubtful pictures."""
+        """Quality of polarization data of most views, with the numbers of other views and doubtful pictures."""
         counts = {"measured": self.measured, "fitted": self.fitted, "none": self.none}
         notes = dict.fromkeys(counts, "")
         if self.pictures:
@@ -118,31 +122,33 @@ HEALTH = "health.json"
 MOST_VIEWS = 64
 """Largest number of examined views."""
 TIME_SHARE = 0.02
-"""Number of examined views over the number of steps. Examining a view takes at most the time of a step."""
+"""Largest number of examined views, as a share of the number of steps. Examining a view takes no longer than a step."""
 NEIGHBORS = 6
-"""Number of neighbors with which a view is compared; smaller captures have no comparison."""
+"""Number of neighbors with which a view is compared. Smaller captures are not compared."""
 HIGHEST_PSNR = 100.0
-"""Upper bound of recorded PSNR values in dB, which equal pictures exceed."""
+"""Upper bound of recorded PSNR values in dB, needed because the PSNR of equal pictures is infinite."""
 Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
 
 
 @dataclass(frozen=True)
 class Limits:
-    """Limits of the facts, beyond which a warning is given.
+    """Limits of the measured values, beyond which a warning is given.
 
     Attributes:
-        far: dB under the median PSNR of the nearest views. 10 dB are ten times the squared error; in sound scenes,
-            neighboring views differ by up to 6 dB.
-        scattered: the same in robust standard deviations of such differences, for scenes with larger differences.
-        brighter: factor over the brightest measured intensity. A filter hides more than half of the light only where
-            more than half of it is polarized, and then in every view.
-        burned: share of the pixels of a view beyond that factor: a spot of 9 x 9 pixels of 320 x 240.
-        exposed: stops between a view and its prediction, in any color, relative to other views. Cameras set exposures
-            in thirds of a stop; this is half of that.
-        fog: mean share of the light of a view from places without surfaces, as visible in dark regions.
-        bare: share of the pixels of a view that are holes. A hole is mostly transparent and has less than half of the
-            measured light, more than any filter explains.
-        unseen: share of the Gaussians outside all views. They enlarge files and appear in views from other sides.
+        far: difference in dB by which the PSNR of a view is lower than the median PSNR of its nearest views. 10 dB mean
+            ten times the squared error. In sound scenes, neighboring views differ by up to 6 dB.
+        scattered: difference as above, in robust standard deviations of all differences. It replaces ``far`` in scenes
+            with larger differences.
+        brighter: factor on the brightest measured intensity. A pixel is burned if it is brighter than the product.
+            Polarization alone does not explain such light, because a filter hides more than half of the light only
+            where more than half of it is polarized.
+        burned: share of burned pixels in a view. The default corresponds to a spot of 9 x 9 pixels in 320 x 240.
+        exposed: difference in stops between the brightness of a view and its prediction, in any color, relative to
+            other views. Cameras change exposures in steps of a third of a stop, and the default is half of a step.
+        fog: mean share of a view's light that comes from places without surfaces. Fog is most visible in dark regions.
+        bare: share of pixels of a view that are holes. A hole is mostly transparent and has less than half of the
+            measured light, which no filter explains.
+        unseen: share of Gaussians that no view shows. They enlarge files and appear in views from other sides.
     """
 
     far: float = 10.0
@@ -160,15 +166,16 @@ LIMITS = Limits()
 
 @dataclass(frozen=True)
 class ViewHealth:
-    """Facts of one training view.
+    """Measured values of one training view.
 
     Attributes:
-        psnr: PSNR of its predicted pictures as displayed, in dB; None without a valid pixel.
-        beside: median PSNR of the nearest views; None with too few views.
-        burned: share of the pixels that are brighter than ``Limits.brighter`` times the brightest measured intensity.
-        fog: mean share of the light from places in front of all surfaces; None if the view shows no SfM points.
-        bare: share of the pixels that are holes, see ``Limits.bare``.
-        stops: median of measured over predicted light in R, G and B, in stops; None without a valid pixel.
+        psnr: PSNR in dB of the predicted pictures of the view, as displayed. None without a valid pixel.
+        beside: median PSNR in dB of the nearest views. None if there are too few views.
+        burned: share of pixels that are brighter than ``Limits.brighter`` times the brightest measured intensity.
+        fog: mean share of the light that comes from places in front of all surfaces. None if the view shows no SfM
+            points.
+        bare: share of pixels that are holes, see ``Limits.bare``.
+        stops: median of measured over predicted light in R, G and B, in stops. None without a valid pixel.
     """
 
     psnr: float | None
@@ -184,11 +191,11 @@ class Health:
     """Health of a training.
 
     Attributes:
-        polarization: evidence behind layers and normals.
-        warnings: texts with a fault, its views, and a remedy.
-        views: examined views by name.
-        brightest: brightest linear intensity that was measured in them.
-        unseen: share of the Gaussians outside all of them; None if a short training examined too few views.
+        polarization: numbers of views by the quality of their polarization data.
+        warnings: messages, each with a fault, the affected views, and a remedy.
+        views: values of the examined views by name.
+        brightest: largest linear intensity that was measured in the examined views.
+        unseen: share of Gaussians that no examined view shows. None if a short training examined too few views.
     """
 
     polarization: PolarizationSupport
@@ -199,7 +206,7 @@ class Health:
 
     @property
     def summary(self) -> str:
-        """Number of examined views and the worst PSNR, in one sentence."""
+        """Message with the number of examined views and the worst PSNR."""
         psnrs = {name: view.psnr for name, view in self.views.items() if view.psnr is not None}
         if not psnrs:
             return "health: no training view was looked at, the training was too short"
@@ -217,10 +224,12 @@ class Health:
 
     @classmethod
     def load(cls, run: Path) -> Health | None:
-        """Read ``health.json``; None for an unfinished training, and for a version without this check.
+        """Read ``health.json`` from a run folder.
+
+        Return None if the training is unfinished, or if its version of polarguide did not write this file.
 
         Raises:
-            PolarguideError: the file cannot be read, or is not such a record.
+            PolarguideError: the file cannot be read or is invalid.
         """
         if not os.path.lexists(run / HEALTH):
             return None
@@ -253,12 +262,12 @@ class RecordedWarnings(Reporter):
 
 @dataclass(frozen=True, eq=False)
 class TrainingEvidence:
-    """Evidence by which a finished training is examined.
+    """Data with which a finished training is examined.
 
     Attributes:
         views: all training views, with the exposures that the training assumed.
-        polarization: evidence of polarization in them.
-        filters: the recipe learns from pictures behind filters.
+        polarization: numbers of these views by the quality of their polarization data.
+        filters: True if the recipe learns from pictures behind filters.
     """
 
     views: Sequence[View]
@@ -266,7 +275,7 @@ class TrainingEvidence:
     filters: bool
 
     def chosen(self, steps: int) -> list[View]:
-        """Return evenly spread views to examine after a number of steps, see ``TIME_SHARE``."""
+        """Return the views to examine after a training of ``steps`` steps, evenly spread; see ``TIME_SHARE``."""
         count = min(MOST_VIEWS, len(self.views), int(TIME_SHARE * steps))
         places = torch.linspace(0, len(self.views) - 1, count).round().long().tolist() if count else []
         return [self.views[place] for place in places]
@@ -276,11 +285,11 @@ class TrainingEvidence:
 def examine(
     model: GaussianModel, evidence: TrainingEvidence, points: Tensor, steps: int, reporter: Reporter
 ) -> Health:
-    """Examine training views.
+    """Render training views, compare them with the photographs, and collect warnings.
 
     Args:
         model: the trained model.
-        evidence: evidence of its training.
+        evidence: views and polarization data of its training.
         points: [M, 3] SfM points of the scene.
         steps: number of steps of the training.
         reporter: receives progress.
@@ -321,12 +330,14 @@ def _brightest(view: View) -> float:
 def _examine_view(
     model: GaussianModel, view: View, limit: float, near: float, filters: bool
 ) -> tuple[ViewHealth, Tensor]:
-    """Return the facts of a view, and the radii [N] of the Gaussians in it.
+    """Return the measured values of a view, and the radii [N] of the Gaussians in it.
 
     Args:
+        model: the trained model.
+        view: the view.
         limit: intensity above which a pixel is burned.
-        near: depth in front of all surfaces; 0: unknown.
-        filters: the model predicts pictures behind filters.
+        near: depth that is nearer than all surfaces. 0 means unknown.
+        filters: True if the model predicts pictures behind filters.
     """
     local = view.to(model.device)
     camera = view.camera
@@ -352,7 +363,7 @@ def _examine_view(
 
 
 def _stops(measured: Tensor, predicted: Tensor, counted: Tensor) -> tuple[float, float, float] | None:
-    """Return the medians of measured over predicted light [H, W, 3] by color, in stops; None if all is black."""
+    """Return the median of measured over predicted light for each color, in stops; None if all pixels are black."""
     lit = counted & (torch.minimum(measured, predicted).amin(dim=-1) > BLACK)
     if not bool(lit.any()):
         return None
@@ -361,9 +372,10 @@ def _stops(measured: Tensor, predicted: Tensor, counted: Tensor) -> tuple[float,
 
 
 def _compared(view: View, final: Tensor, stokes: Tensor | None) -> tuple[Tensor, Tensor]:
-    """Return the measured and the predicted pictures of a view, [K, H, W, 3] linear each.
+    """Return the measured and the predicted pictures of a view, each [K, H, W, 3] linear.
 
-    These are all pictures behind known filters if they are predicted, and the photograph otherwise.
+    If the model predicts Stokes vectors, these are all pictures behind filters at known angles. Otherwise it is the
+    photograph.
     """
     indices = [k for k, exposure in enumerate(view.exposures) if exposure.known]
     if stokes is None or not indices:
@@ -375,9 +387,10 @@ def _compared(view: View, final: Tensor, stokes: Tensor | None) -> tuple[Tensor,
 
 
 def _neighbor_psnr(views: Sequence[View], psnr: Mapping[str, float | None]) -> dict[str, float]:
-    """Return the median PSNR of the nearest views of each view; empty with too few views.
+    """Return, for each view, the median PSNR of its nearest views; empty if there are too few views.
 
-    Distances are those of camera centers, relative to their mean distance from the middle, and of viewing directions.
+    The distance between two views combines two parts. One is the distance of the camera centers, divided by the mean
+    distance of the centers from their middle. The other is the difference of the viewing directions.
     """
     scored = [view for view in views if psnr[view.name] is not None]
     if len(scored) <= NEIGHBORS:
@@ -398,12 +411,12 @@ def _share(pixels: Tensor) -> float:
 
 
 def warnings_of(views: Mapping[str, ViewHealth], unseen: float | None, limits: Limits = LIMITS) -> list[str]:
-    """Return warnings, the most severe first.
+    """Return the warnings, the most severe first.
 
     Args:
-        views: examined views by name.
-        unseen: share of unseen Gaussians; None: unknown.
-        limits: limits of the facts.
+        views: values of the examined views by name.
+        unseen: share of Gaussians that no view shows. None means unknown.
+        limits: limits of the values.
     """
     warnings = []
     bare = {name: view.bare for name, view in views.items() if view.bare > limits.bare}
@@ -455,7 +468,10 @@ def warnings_of(views: Mapping[str, ViewHealth], unseen: float | None, limits: L
 
 
 def _exposed(views: Mapping[str, ViewHealth], limits: Limits) -> dict[str, float]:
-    """Return the deviations of views with another exposure from the other views, in stops, the largest first."""
+    """Find views whose exposure differs from the other views.
+
+    Return their differences in stops by the name of the view, the largest first.
+    """
     stops_by_view = {name: torch.tensor(view.stops) for name, view in views.items() if view.stops is not None}
     if len(stops_by_view) <= NEIGHBORS:
         return {}
@@ -482,19 +498,19 @@ def _far_under(views: Mapping[str, ViewHealth], limits: Limits) -> list[str]:
 
 
 def _worst(shares: Mapping[str, float], of: str = "of the pixels") -> str:
-    """Return a list of views by their shares, the largest first."""
+    """Return the names of views as text, ordered by decreasing share, with the share of the first view."""
     first, *rest = sorted(shares, key=lambda name: -shares[name])
     return listed([f"{first} ({100 * shares[first]:.1f} % {of})", *rest])
 
 
 @dataclass(eq=False)
 class HealthCheck(Callback[TrainingLoop]):
-    """Examination of a finished training: writes ``health.json`` and reports a summary.
+    """Callback that examines a finished training, writes ``health.json`` and reports a summary.
 
     Args:
         out: the run folder.
-        fits: fits of polarizer angles of the training.
-        reports: reporter of the other reports of the training, whose warnings are recorded as well.
+        fits: callback that fitted the polarizer angles of the training.
+        reports: reporter of the other reports. Their warnings are added to ``health.json``.
     """
 
     out: Path
@@ -520,11 +536,11 @@ class HealthCheck(Callback[TrainingLoop]):
 
 
 METALS_PICTURE = "metals.png"
-"""File with the picture of metals in a run folder."""
+"""Name of the picture of metals in a run folder."""
 METAL_VIEWS = 6
 """Largest number of training views in that picture."""
 LARGEST_DIFFERENCE = 90.0
-"""Largest difference of two polarizer angles, in degrees."""
+"""Largest possible difference between two polarizer angles, in degrees."""
 
 
 def report_polarizers(out: Path, scene: Scene, polarizers: Polarizers, reporter: Reporter) -> None:
@@ -608,12 +624,12 @@ def report_polarizers(out: Path, scene: Scene, polarizers: Polarizers, reporter:
 def report_metals(
     out: Path, scene: Scene, undecided: Tensor | None, model: GaussianModel, reporter: Reporter
 ) -> None:
-    """Report metals and undecided surfaces, and write ``metals.png`` with both.
+    """Report metals and surfaces that may be metals, and write the picture ``metals.png`` of both.
 
     Args:
         out: the run folder.
         scene: the capture.
-        undecided: see ``MetalSearch.undecided``; None: no report.
+        undecided: result of ``MetalSearch.undecided``. With None, there is no report.
         model: the trained Gaussians.
         reporter: receives a summary.
     """
@@ -646,7 +662,10 @@ def report_metals(
 
 
 def picture_files(scene: Scene) -> dict[str, list[str]]:
-    """Return the file names of each view's pictures; for a scene that is not read from such files, VIEW#NUMBER."""
+    """Return the file names of the pictures of each view.
+
+    Pictures that were not read from separate files are named VIEW#NUMBER.
+    """
     try:
         layout = find_layout(scene.root)
     except PolarguideError:
@@ -661,11 +680,11 @@ def picture_files(scene: Scene) -> dict[str, list[str]]:
 
 @dataclass(eq=False)
 class PolarizerReport(Callback[TrainingLoop]):
-    """Report of the polarizer angles at the end of a training.
+    """Callback that reports the polarizer angles at the end of a training.
 
     Args:
         out: the run folder.
-        fits: fits of the angles.
+        fits: callback that fitted the angles.
         reporter: receives the report.
     """
 
@@ -679,7 +698,7 @@ class PolarizerReport(Callback[TrainingLoop]):
 
 @dataclass(eq=False)
 class MetalReport(Callback[TrainingLoop]):
-    """Report of the metals at the end of a training.
+    """Callback that reports metals at the end of a training.
 
     Args:
         out: the run folder.
@@ -698,7 +717,7 @@ class MetalReport(Callback[TrainingLoop]):
 
 @dataclass(eq=False)
 class PlyFile(Callback[TrainingLoop]):
-    """PLY of the trained Gaussians in the run folder ``out``."""
+    """Callback that writes the trained Gaussians as a PLY file to the run folder ``out``."""
 
     out: Path
 

@@ -1,4 +1,4 @@
-"""Plan of the memory of a training, made from the headers of its files before a picture is decoded."""
+"""Memory plan of a training, computed from the headers of the picture files before a picture is decoded."""
 
 from __future__ import annotations
 
@@ -25,35 +25,36 @@ GIGABYTE = 10**9
 # Estimates from the tensors of a training; one (24 steps, 1224 x 1024 x 60, 4 GB) took 12 % less.
 # benchmarks/speed/memory.py measures them.
 PROCESS = 250_000_000
-"""Bytes of a process beyond those before the training: libraries, and fragmentation of the allocator."""
+"""Bytes that a training adds to the process for libraries and fragmentation of the allocator."""
 STEP = 780
-"""Bytes per pixel of a step: targets, G-buffer, layers, terms, and their gradients."""
+"""Bytes per pixel that a step needs for targets, G-buffer, layers, loss terms and gradients."""
 PRIORS = 900
-"""Bytes per pixel of the computation of a view's priors."""
+"""Bytes per pixel that the computation of a view's priors needs."""
 PRIORS_KEPT = 44
-"""Cached bytes per pixel for targets from priors."""
+"""Bytes per pixel of cached priors."""
 SHOWN_KEPT = 8
-"""Cached bytes per pixel for the photograph and its masks."""
+"""Bytes per pixel of the cached photograph and its masks."""
 UNGUIDED_KEPT = 13
-"""Cached bytes per pixel for targets without a guide."""
+"""Bytes per pixel of cached data that do not depend on the guide, see ``training.priors.Unguided``."""
 COPIES = 5
-"""Copies of a Gaussian's parameters in memory: values, gradients, two moments, frozen values."""
+"""Number of copies of a Gaussian's parameters in memory: values, gradients, two moments, and frozen values."""
 WRITTEN = 4
-"""Copies of a Gaussian's parameters while a file is written."""
+"""Number of copies of a Gaussian's parameters in memory while a file is written."""
 SPLAT = 600
-"""Bytes per Gaussian of a rasterizer's intermediate results."""
+"""Bytes per Gaussian of intermediate results of the rasterizer."""
 FILLED = 0.88
-"""Share of a limit up to which per-view data stay in memory; the rest is a margin for fragmentation."""
+"""Share of the memory limit that may be used. The rest is a margin for fragmentation."""
 
 
 @dataclass(frozen=True)
 class MemoryPlan:
-    """Memory of a training.
+    """Distribution of the memory of a training.
 
     Attributes:
-        hold: the pictures stay in memory; otherwise views decode theirs again.
-        view_bytes: bytes of computed per-view data in memory, beyond which they are in a file; None: no limit.
-        peak: largest number of bytes of the process.
+        hold: True if all pictures stay in memory. Otherwise views decode their pictures again at each use.
+        view_bytes: largest number of bytes of computed per-view data in memory. Data beyond it are stored in a file.
+            None means no limit.
+        peak: largest number of bytes that the process uses.
     """
 
     hold: bool
@@ -67,14 +68,14 @@ def plan_memory(
     """Divide memory among the steps, the Gaussians and the views of a training.
 
     Args:
-        pixels: pixels of each view in the training.
+        pixels: number of pixels of each view, after downscaling.
         recipe: the method.
         gaussians: largest number of Gaussians.
-        limit: memory limit of the process in GiB; None: four fifths of the free memory.
-        in_memory: the pictures are in memory already.
+        limit: memory limit of the process in GiB. None means four fifths of the free memory.
+        in_memory: True if the pictures are already in memory.
 
-    Raises:
-        PolarguideError: the specified limit is too small; the message has the smallest sufficient one.
+            Raises:
+                PolarguideError: the specified limit is too small. The message contains the smallest sufficient limit.
     """
     largest = max(pixels, default=0)
     floats = sum(math.prod(shape) for shape in recipe.shapes.values())
@@ -92,12 +93,12 @@ def share_memory(
     """Divide memory between a training and its views.
 
     Args:
-        pixels: pixels of each view in the training.
-        own: bytes of the training without its views.
-        of_view: cached bytes per pixel of a view.
-        limit, in_memory: see ``plan_memory``.
-        what: further needs of memory, for the message.
-        less: further remedy, for the message.
+        pixels: number of pixels of each view, after downscaling.
+        own: bytes that the training needs apart from its views.
+        of_view: bytes per pixel of the cached data of a view.
+        limit, in_memory: arguments of ``plan_memory``.
+        what: other data that need memory, for the message.
+        less: additional remedy for the message.
 
     Raises:
         PolarguideError: the specified limit is too small.
@@ -129,7 +130,7 @@ def share_memory(
 
 
 def pixels_of(folder: Path, downscale: int) -> list[int]:
-    """Return the pixels of each view of a scene in the training, from the headers of its files.
+    """Return the number of pixels of each view of a scene after downscaling, from the headers of its files.
 
     Raises:
         PolarguideError: the folder is no scene.
@@ -139,7 +140,7 @@ def pixels_of(folder: Path, downscale: int) -> list[int]:
 
 
 def too_little(least: int, allowed: int, what: str, less: str) -> PolarguideError:
-    """Return the error of a limit that is too small for pictures and ``what``; ``less`` is a further remedy."""
+    """Return the error for a memory limit that is too small for pictures and ``what``; ``less`` extends the remedy."""
     return PolarguideError(
         "memory",
         expected=f"at least {in_gigabytes(least)} for pictures of this size{what}",
@@ -149,6 +150,9 @@ def too_little(least: int, allowed: int, what: str, less: str) -> PolarguideErro
 
 
 def in_gigabytes(count: int, *, up: bool = True) -> str:
-    """Format bytes as gigabytes with one digit, rounded up by default, so that the stated number suffices."""
+    """Format a number of bytes as gigabytes with one decimal place.
+
+    By default it is rounded up, so that a limit of the displayed size suffices.
+    """
     tenths = count * 10 / GIGABYTE
     return f"{(math.ceil(tenths) if up else math.floor(tenths)) / 10:.1f} GB"

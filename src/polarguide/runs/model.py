@@ -1,7 +1,8 @@
-"""Model of a run, which renders layers, and its PLY.
+"""Model of a run, which renders layers and is written to PLY files.
 
-The PLY holds display values that ordinary 3DGS viewers show correctly, in the fields of the 3DGS release alone: readers
-with a fixed layout would read further fields as the next Gaussian. Linear fields of polarguide are written on request.
+A PLY file holds display values, which ordinary 3DGS viewers show correctly. By default it has only the fields of the
+3DGS release, because some viewers assume this layout and would misread additional fields. Linear fields of polarguide
+are written on request.
 """
 
 from __future__ import annotations
@@ -31,18 +32,21 @@ from polarguide.training.settings import ResolvedSettings
 from polarguide.training.state import TrainingState
 
 Within = Callable[[Tensor], Tensor]
-"""Function that returns the visible ones of places [N, 3] of the scene, [N] bool."""
+"""Function that maps positions [N, 3] in the scene to a mask [N], True for visible positions."""
 
 
 def layers_of(shading: ShadingModel) -> tuple[str, ...]:
-    """Return the layers of a shading model in the order of ``LAYERS``, then ``POLARIZED`` if it predicts them."""
+    """Return the names of the layers of a shading model, in the order of ``LAYERS``.
+
+    The names in ``POLARIZED`` follow if the model predicts Stokes vectors.
+    """
     predicts = {"specular", "diffuse", "normal"} <= {*shading.layers}
     return (*(name for name in LAYERS if name in shading.layers), *(POLARIZED if predicts else ()))
 
 
 @dataclass(frozen=True, eq=False)
 class GaussianModel:
-    """A trained model for scoring and viewing: Gaussians, their light, and their shading."""
+    """Trained model that renders views: Gaussians, learned light, and shading model."""
 
     state: TrainingState
     shading: ShadingModel
@@ -101,9 +105,12 @@ class GaussianModel:
             camera: any camera.
             normals: render normals even if the model does not need them.
             depth: render the depth.
-            surface: normals and depth are those of the surface at the pixel's median depth, see ``raster.surface``.
-            within: returns the visible ones of places [N, 3] of the scene, [N] bool; None: all are visible.
-        """
+            surface: True to render normals and depth of the surface at the pixel's median depth, see
+                ``raster.surface``.
+            within: function that maps positions [N, 3] in the scene to a mask [N] of visible positions. None means all
+                are visible.
+
+            """
         gaussians: Parameters = self.state.gaussians
         footprints = self.state.footprints
         if within is not None:
@@ -122,14 +129,17 @@ class GaussianModel:
 
     @torch.no_grad()
     def stokes(self, result: RenderResult, camera: Camera) -> Tensor | None:
-        """Return the predicted Stokes vectors [3, H, W, 3] of a picture; None without both layers and a normal."""
+        """Return the predicted Stokes vectors [3, H, W, 3] of a picture.
+
+        Return None if the specular layer, the diffuse layer or the normal is missing.
+        """
         if not result.is_polarized:
             return None
         return self.shading.predicted_stokes(result, camera)
 
     @torch.no_grad()
     def alpha_in_front(self, camera: Camera, depth: Tensor) -> Tensor:
-        """Return the share of each pixel's alpha that is nearer than a depth [H, W], see ``raster.surface``."""
+        """Return the share of each pixel's alpha in front of a depth [H, W], see ``raster.surface``."""
         drawn = splats(self.state.gaussians)
         footprints = self.state.footprints
         if footprints is not None:
@@ -148,7 +158,7 @@ def gaussian_colors(gaussians: Parameters, light: Light, shading: ShadingModel, 
         directions: [K, 3] unit, from the camera to the Gaussian.
 
     Returns:
-        [N, K, 3]. Each Gaussian is shaded at its own normal, the best that a splat can do for a reflection.
+        Colors [N, K, 3]. Each Gaussian is shaded with its own normal, because a single splat has no blended normal.
     """
     return torch.stack(_toward(gaussians, light, shading, directions), dim=1)
 
@@ -162,12 +172,12 @@ def baked_harmonics(
     present: Callable[[Tensor], Tensor],
     linear: bool,
 ) -> tuple[Tensor, Tensor]:
-    """Return the harmonics of ``gaussian_colors``, see ``refit_sh``.
+    """Fit harmonics to the colors of ``gaussian_colors`` by ``refit_sh``.
 
     Args:
-        gaussians, light, shading: those of the run.
-        present: maps linear colors to displayed ones.
-        linear: displayed colors are linear as well.
+        gaussians, light, shading: Gaussians, learned light and shading model of the run.
+        present: function from linear colors to the colors that are shown.
+        linear: True if the shown colors are linear as well.
     """
     parameters = {
         name: values
@@ -187,7 +197,7 @@ def baked_harmonics(
 
 
 def _toward(gaussians: Parameters, light: Light, shading: ShadingModel, directions: Tensor) -> list[Tensor]:
-    """Compute ``gaussian_colors`` direction by direction: K of [N, 3]."""
+    """Compute ``gaussian_colors`` for one direction at a time, as a list of K tensors [N, 3]."""
     means = gaussians["means"]
     center = means.new_zeros(3)
     normals = shortest_axis_normals(means, gaussians["quaternions"], gaussians["log_scales"], center)
@@ -202,11 +212,13 @@ def _toward(gaussians: Parameters, light: Light, shading: ShadingModel, directio
 
 @torch.no_grad()
 def learned_normals(gaussians: Parameters, centers: Tensor | None) -> Tensor:
-    """Return unit normals of all Gaussians, [N, 3]: their shortest axes, turned toward the nearest camera.
+    """Return the unit normals [N, 3] of all Gaussians.
+
+    A normal is the shortest axis of a Gaussian, turned toward the nearest camera.
 
     Args:
         gaussians: the Gaussians.
-        centers: [M, 3] camera centers; None: normals point away from the middle of the Gaussians.
+        centers: [M, 3] camera centers. With None, normals point away from the middle of the Gaussians.
     """
     means = gaussians["means"].detach().cpu()
     quaternions, log_scales = (gaussians[name].detach().cpu() for name in ("quaternions", "log_scales"))
@@ -231,15 +243,17 @@ def write_run_ply(
     linear: bool = False,
     own_fields: Mapping[str, Tensor] = MappingProxyType({}),
 ) -> None:
-    """Write the trained Gaussians, see the module's text.
+    """Write the trained Gaussians to a PLY file, as the module describes.
 
     Args:
         path: the file.
-        state, shading: those of the run.
+        state: state of the training.
+        shading: shading model of the run.
         centers: [M, 3] camera centers, see ``learned_normals``.
-        color: [3, 3] matrix of a presentation. It applies to the harmonics that other programs show, not to own fields.
-        linear: harmonics of linear colors, for readers that need them.
-        own_fields: further fields [N, ...] by name.
+        color: [3, 3] color matrix of a presentation. It changes the harmonics that other programs show, but not the
+            fields of polarguide.
+        linear: True to write harmonics of linear colors, for programs that expect them.
+        own_fields: additional fields [N, ...] by name.
     """
     gaussians = state.gaussians
 

@@ -1,4 +1,4 @@
-"""An opened run folder: its configuration, its model, its scene (read on first use), and its layers."""
+"""Access to a finished or unfinished run: its configuration, model, scene and rendered layers."""
 
 from __future__ import annotations
 
@@ -35,14 +35,14 @@ Opened = TypeVar("Opened", bound="OpenedRun")
 
 
 class OpenedRun:
-    """A trained run: its configuration, its model, and its layers.
+    """A trained run that renders layers of any view. Its scene is read on first use.
 
     Args:
         folder: folder of the run.
         configuration: record of the training.
         recipe: the method.
         model: the trained model.
-        scene: the scene or its folder, if that is not the folder in the configuration.
+        scene: the scene or its folder. None means the folder in the configuration.
         reporter: receives the progress of reading the scene.
     """
 
@@ -68,7 +68,7 @@ class OpenedRun:
         return f"<{type(self).__name__} {self.folder}: {facts}\n polarization: {self._evidence()}>"
 
     def _evidence(self) -> str:
-        """Return ``polarization``, or a text for a damaged record; representations raise no errors."""
+        """Return ``polarization``, or a message if the record is damaged, because ``repr`` must not raise errors."""
         try:
             return self.polarization
         except PolarguideError as error:
@@ -84,17 +84,17 @@ class OpenedRun:
         device: DeviceName = "auto",
         reporter: Reporter = SILENT,
     ) -> Opened:
-        """Open a run folder. Warns if the shading of the recipe has changed since the training.
+        """Open a run folder, and warn if the shading of the recipe has changed since the training.
 
         Args:
-            folder: folder of a training.
-            recipe: the recipe of the training or its name, if it is not built in.
-            scene: the scene or its folder, if it was moved; read on first use.
+            folder: folder of the run.
+            recipe: the recipe of the training, or its name. It is needed only if the recipe is not built in.
+            scene: the scene or its folder, which is needed only if the scene was moved. It is read on first use.
             device: device of the computation.
             reporter: receives the progress of long operations.
 
         Raises:
-            PolarguideError: the folder is no run, is damaged, or belongs to another version.
+            PolarguideError: the folder is not a run, is damaged, or belongs to another version of polarguide.
         """
         folder = Path(folder)
         configuration = RunConfiguration.load(folder)
@@ -115,7 +115,7 @@ class OpenedRun:
 
     @classmethod
     def of(cls: type[Opened], run: OpenedRun) -> Opened:
-        """Convert an opened run to this class; both share the scene and the model."""
+        """Convert an opened run to this class. Both objects share the scene and the model."""
         scene = run._scene_source
         reporter = run._reporter
         return cls(run.folder, run.configuration, run.recipe, run.model, scene=scene, reporter=reporter)
@@ -127,24 +127,27 @@ class OpenedRun:
 
     @property
     def gaussians(self) -> dict[str, Tensor]:
-        """Parameters by name, one row per Gaussian: ``means`` [N, 3], ``log_scales`` [N, 3], ... Do not change them."""
+        """Parameters of the Gaussians by name, such as ``means`` [N, 3]; do not change them."""
         gaussians = self.model.state.gaussians
         return {name: gaussians[name].detach() for name in gaussians.names}
 
     @property
     def health(self) -> Health | None:
-        """Health of the training; None for an unfinished training, and for an earlier version.
+        """Result of the check at the end of the training.
+
+        It is None if the training is unfinished, or if its version of polarguide had no such check.
 
         Raises:
-            PolarguideError: ``health.json`` is not such a record.
+            PolarguideError: ``health.json`` is invalid.
         """
         return Health.load(self.folder)
 
     @property
     def polarization(self) -> str:
-        """Evidence behind layers and normals as text: ``measured``, ``fitted`` or ``none``, with exceptions.
+        """Quality of the polarization data of most training views, as text.
 
-        ``not recorded`` without ``health``.
+        The text begins with ``measured``, ``fitted`` or ``none``, and lists exceptions. It is ``not recorded`` if
+        ``health`` is None.
         """
         health = self.health
         return "not recorded" if health is None else health.polarization.text
@@ -156,10 +159,10 @@ class OpenedRun:
 
     @cached_property
     def scene(self) -> Scene:
-        """The scene of the training, read on first use. Warns if it has changed since.
+        """The scene of the training, read on first use. A warning is given if it has changed since the training.
 
         Raises:
-            PolarguideError: the scene was moved or deleted, cannot be read, or was read with other options for
+            PolarguideError: the scene was moved or deleted, cannot be read, or was read with different options in the
                 training.
         """
         configuration = self.configuration
@@ -186,7 +189,7 @@ class OpenedRun:
 
     @property
     def scene_folder(self) -> Path:
-        """Folder of the scene, or its folder at the time of the training."""
+        """Folder of the scene: the specified folder, or else the folder at the time of the training."""
         source = self._scene_source
         return source.root if isinstance(source, Scene) else Path(source or self.configuration.scene)
 
@@ -197,7 +200,7 @@ class OpenedRun:
 
     @property
     def new_place(self) -> str:
-        """Remedy for a scene that was moved."""
+        """Advice for errors about a scene that was moved."""
         return (
             f"If it was moved, specify its place: {command('present', self.folder, '--scene', 'NEWPLACE')}."
         )
@@ -206,11 +209,11 @@ class OpenedRun:
         """Record the new folder of the scene in ``run.json``.
 
         Raises:
-            PolarguideError: the folder has no scene, or another one than that of the training.
+            PolarguideError: the folder contains no scene, or a scene other than the scene of the training.
         """
         moved = OpenedRun(self.folder, self.configuration, self.recipe, self.model, scene=scene)
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", PolarguideWarning)  # a changed scene is an error here
+            warnings.simplefilter("ignore", PolarguideWarning)  # a changed scene raises an error here
             digest = moved.scene.digest
         if digest != self.configuration.scene_digest:
             raise PolarguideError(
@@ -226,28 +229,30 @@ class OpenedRun:
 
     @property
     def presentation(self) -> Presentation:
-        """Presentation of the run: its own ``presentation.json`` over that of its scene, as they are now.
+        """Presentation of the run, read from the current files.
+
+        Values in ``presentation.json`` of the run take precedence over values in ``presentation.json`` of its scene.
 
         Raises:
-            PolarguideError: a file is not such a record.
+            PolarguideError: a file is invalid.
         """
         return read_presentation(self.folder).over(read_presentation(self.scene_folder))
 
     @cached_property
     def camera_frame(self) -> SceneFrame:
-        """Frame of the scene's cameras, with their up direction; reads their poses, not their pictures.
+        """Frame of the scene's cameras, with their up direction. Only poses are read, not pictures.
 
         Raises:
-            PolarguideError: the scene does not exist any more, or has no such poses.
+            PolarguideError: the scene does not exist any more, or its poses cannot be read.
         """
         return scene_frame([*self.poses.values()])
 
     @cached_property
     def poses(self) -> dict[str, Camera]:
-        """Cameras of the scene's views by name, without the pictures.
+        """Cameras of the scene's views by name. Only poses are read, not pictures.
 
         Raises:
-            PolarguideError: the scene does not exist any more, or has no such poses.
+            PolarguideError: the scene does not exist any more, or its poses cannot be read.
         """
         if self._holds_scene:
             return self.cameras
@@ -271,7 +276,7 @@ class OpenedRun:
         return "scene" in self.__dict__ or isinstance(self._scene_source, Scene)
 
     def _folder_to_read(self) -> Path:
-        """Return ``scene_folder``, to read from it.
+        """Return ``scene_folder`` after a check that it exists.
 
         Raises:
             PolarguideError: the scene consists of arrays and has no folder, or the folder does not exist any more.
@@ -295,12 +300,12 @@ class OpenedRun:
 
     @property
     def frame(self) -> SceneFrame:
-        """``camera_frame``, with the up axis of the presentation if it has one."""
+        """Frame of the scene: ``camera_frame``, with the up axis of the presentation if one is specified."""
         return self.presentation.upright(self.camera_frame)
 
     @property
     def cameras(self) -> dict[str, Camera]:
-        """Cameras of the scene's views by name; reads the scene."""
+        """Cameras of the scene's views by name. The scene is read on first use."""
         return {view.name: view.camera for view in self.scene.views}
 
     @property
@@ -318,14 +323,16 @@ class OpenedRun:
         polarized: bool = False,
         within: Within | None = None,
     ) -> RenderResult:
-        """Render all requested data as one typed record on the run's device.
+        """Render a view, and return all layers as one typed record on the run's device.
 
         Args:
-            camera: any camera, or the name of a view (then the scene is read).
-            normals, depth: render these layers even if the recipe does not need them.
-            surface: they are those of the surface at the pixel's median depth; otherwise blended, which is faster.
-            polarized: predict Stokes vectors, if the model supports it.
-            within: returns the visible ones of places [N, 3] of the scene, [N] bool; None: all are visible.
+            camera: any camera, or the name of a view, for which the scene is read.
+            normals, depth: True to render these layers even if the recipe does not need them.
+            surface: True for normals and depth of the surface at the pixel's median depth. Otherwise both are blended,
+                which is faster.
+            polarized: True to predict Stokes vectors, if the model supports it.
+            within: function that maps positions [N, 3] in the scene to a mask [N] of visible positions. None means all
+                are visible.
         """
         chosen = self.scene.view(camera).camera if isinstance(camera, str) else camera
         result = self.model.render(chosen, normals=normals, depth=depth, surface=surface, within=within)
@@ -336,14 +343,17 @@ class OpenedRun:
         """Render layers of a picture.
 
         Args:
-            camera: any camera, or the name of a view (then the scene is read).
-            layers: names in ``layers``.
+            camera: any camera, or the name of a view, for which the scene is read.
+                        layers: names of layers, see the property ``layers``.
 
-        Returns:
-            By name: linear radiance [H, W, 3] on the scale of S0/2, world normals [H, W, 3] of any length, or [H, W]
-                for strength, roughness, metalness, depth and alpha. Predicted polarization: ``stokes`` [3, H, W, 3] in
-                the lens frame, as ``View.stokes`` measures it; ``dolp`` [H, W] in [0, 1] and ``aolp`` [H, W] radians in
-                [0, pi) of its luminance.
+                    Returns:
+                        The layers by name. Most layers are linear radiance [H, W, 3] on the scale of S0/2. Normals are
+                        [H, W, 3]
+                        in world axes and have any length. Strength, roughness, metalness, depth and alpha are [H, W].
+                        Polarization is predicted: ``stokes`` is [3, H, W, 3] in the lens frame, as ``View.stokes``
+                            measures it.
+                        ``dolp`` [H, W] in [0, 1] and ``aolp`` [H, W] in [0, pi) radians are computed from its
+                        luminance.
 
         Raises:
             PolarguideError: a layer is unknown, or this recipe does not render it.
@@ -372,10 +382,10 @@ class OpenedRun:
 
 
 def checked_layers(names: list[str]) -> list[str]:
-    """Check that names are one or more names of layers, and return them.
+    """Check the names of layers, and return them as a list.
 
     Raises:
-        PolarguideError: a name is unknown, or there is no name.
+        PolarguideError: a name is unknown, or the list is empty.
     """
     for name in names or ["none"]:
         check_choice("layers", name, (*LAYERS, *POLARIZED))
@@ -394,9 +404,9 @@ def read_scene(
 
     Args:
         folder: folder of the scene.
-        options: options of reading.
+        options: options for reading the scene.
         reporter: receives progress.
-        test_views, hold: see ``load_scene``.
+        test_views, hold: arguments of ``load_scene``.
 
     Raises:
         PolarguideError: the scene cannot be read.
@@ -417,11 +427,11 @@ def read_scene(
 
 
 def trained_scene(scene: Scene, settings: TrainSettings | ResolvedSettings) -> Scene:
-    """Return the scene with the exposures and the background of a training with these settings."""
+    """Return a copy of the scene with the exposures and the background that the settings specify."""
     chosen = select_exposures(scene, settings.exposures)
     return mask_background(chosen) if settings.background == "masked" else chosen
 
 
 def _warn(text: str) -> None:
-    """Warn the caller of this package."""
+    """Issue a warning that points to the code that called this package."""
     warnings.warn(text, PolarguideWarning, stacklevel=4)

@@ -1,6 +1,7 @@
-"""Materials that were painted over a run: RUN/materials/<view>.png, with the numbers of the scene's materials.
+"""Materials that the user painted in the viewer of a run, stored as RUN/materials/<view>.png.
 
-They have the size of the training views, and take precedence over those of the scene.
+The pictures have the size of the training views and contain the numbers of the scene's materials. They take precedence
+over the materials of the scene.
 """
 
 from __future__ import annotations
@@ -22,18 +23,19 @@ from polarguide.core.errors import PolarguideError
 from polarguide.core.files import atomic_folder, read_file
 
 FOLDER = "materials"
-"""Name of their folder in a run folder."""
+"""Name of the folder of painted materials in a run folder."""
 LARGEST = 1 << 26
-"""Largest size of a picture in bytes."""
+"""Largest size of a file in bytes."""
 REMEDY = "Paint and save again in polarguide view RUN, or remove the folder."
 
 
 @dataclass(frozen=True, eq=False)
 class PaintedMaterials:
-    """Pictures of materials.
+    """Painted materials of the training views.
 
     Attributes:
-        numbers: [H, W] uint8 by view: 0 no label, 1 dielectric, 2 metal, from 3 on those of ``scene.json``.
+        numbers: material of each pixel by view, [H, W] uint8. 0 means no label, 1 dielectric, and 2 metal. Larger
+            numbers are defined in ``scene.json``.
         digest: SHA-256 of the files.
     """
 
@@ -53,7 +55,7 @@ class PaintedMaterials:
 
 
 def read_painted(run: Path, scene: Scene) -> PaintedMaterials | None:
-    """Read the materials that were painted over a run; None without a label.
+    """Read the painted materials of a run. Return None if no pixel has a label.
 
     Raises:
         PolarguideError: a picture belongs to no view or to a held-out view, is damaged, has another size, or has a

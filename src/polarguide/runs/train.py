@@ -1,4 +1,4 @@
-"""Training of a run: the loop with its log, checkpoints and a clean stop, and resuming."""
+"""Training into a run folder, with a log, checkpoints and a clean stop, and resuming of a run."""
 
 from __future__ import annotations
 
@@ -64,9 +64,9 @@ def train_gaussians(
     watch: Callable[[TrainingLoop], AbstractContextManager[Look]] | None = None,
     callbacks: Sequence[AnyCallback] = (),
 ) -> OpenedRun:
-    """Train a recipe on a scene, into a run folder.
+    """Train a recipe on a scene, and write the result to a run folder.
 
-    KeyboardInterrupt (Ctrl-C, or the stop button of a notebook) is passed on after the state has been saved. If it
+    KeyboardInterrupt (Ctrl-C, or the stop button of a notebook) is raised again after the state has been saved. If it
     interrupts a change of the state, the previous checkpoint remains.
 
     Args:
@@ -75,15 +75,16 @@ def train_gaussians(
         recipe: the method, or its name.
         settings: steps, seed and other settings of the training; ``resolve`` completes them.
         session: device, threads, and number of steps between two checkpoints.
-        resume: continue the run in ``out``, to the same result.
+        resume: True to continue the run in ``out``. The result is the same as without the interruption.
         reporter: receives progress.
-        should_stop: called between steps; returns True to end the training.
-        watch: returns a context for the loop with a function to call between steps.
-        callbacks: further callbacks, see ``training.callback.Callback``; they run after those of the method.
+        should_stop: function that is called between steps and returns True to end the training.
+        watch: function that returns a context manager for the loop. The context yields a function that is called
+            between steps.
+        callbacks: additional callbacks, see ``training.callback.Callback``. They run after the callbacks of the method.
 
-    Raises:
-        PolarguideError: wrong input, an unsuitable folder, or a loss that is not finite.
-        TrainingStopped: ``should_stop`` returned True; the state is saved.
+            Raises:
+                PolarguideError: the input is invalid, the folder is unsuitable, or a loss is not finite.
+                TrainingStopped: ``should_stop`` returned True. The state has been saved.
     """
     out = Path(out)
     use_threads(session.threads)
@@ -150,7 +151,7 @@ def _report_settings(
     *,
     resume: bool,
 ) -> None:
-    """Report settings that come from the scene, and processes without a view."""
+    """Report settings that depend on the scene, and warn about processes without a view."""
     if settings.refractive_index is None and not resume and scene.refractive_index is not None:
         reporter.say(f"refractive index {scene.refractive_index:g} from scene.json")
     idle = ranks.world - resolved.views_per_step
@@ -163,9 +164,9 @@ def _report_settings(
 def _resumed_state(
     out: Path, recipe: Recipe, configuration: RunConfiguration, reporter: Reporter, *, leads: bool
 ) -> TrainingState | None:
-    """Read the state to resume from; None if the run has no checkpoint.
+    """Read the state to resume from. Return None if the run has no checkpoint.
 
-    If the painted materials differ from those of the training, the state goes back to the last step that decides on
+    If the painted materials have changed since the training, the state is set back to the last step that searches for
     metals.
     """
     settings = configuration.settings
@@ -201,7 +202,7 @@ def _planned(
 
 
 def view_store(plan: MemoryPlan, backend: Backend, out: Path, reporter: Reporter) -> ViewStore:
-    """Return the cache of per-view data. On a GPU, all data stay on the device."""
+    """Create the cache of per-view data. On a GPU, all data stay on the device."""
     if plan.view_bytes is None or backend.device.type != "cpu":
         return ViewStore()
     make_folder(out)
@@ -209,14 +210,17 @@ def view_store(plan: MemoryPlan, backend: Backend, out: Path, reporter: Reporter
 
 
 def _check_out(out: Path, resume: bool, ranks: Ranks) -> None:
-    """Check the folder on rank 0, before that rank writes to it, and end all ranks if it is unsuitable."""
+    """Check the folder on rank 0 before it writes to it, and end all ranks if the folder is unsuitable."""
     problem = unsuitable_folder(out, resume) if ranks.rank == 0 else None
     if ranks.any(problem is not None):
         raise problem or SystemExit(2)
 
 
 def unsuitable_folder(out: Path, resume: bool) -> PolarguideError | None:
-    """Return the error for a folder that is no new folder or, to resume, no run; None for a suitable one."""
+    """Return the error for an unsuitable run folder, or None for a suitable folder.
+
+    A new training needs a new folder. Resuming needs a folder with a run.
+    """
     try:
         check_out(out)
         refuse_scene(out)
@@ -233,10 +237,10 @@ def unsuitable_folder(out: Path, resume: bool) -> PolarguideError | None:
 
 
 def check_trainable(scene: Scene) -> None:
-    """Check that the training views are from at least two places; warn if no camera faces a point.
+    """Check that the training views were taken from at least two places, and warn if no camera faces a point.
 
     Raises:
-        PolarguideError: all training views are from one place.
+        PolarguideError: all training views were taken from one place.
     """
     centers = torch.stack([view.camera.center for view in scene.train_views])
     if float((centers - centers[0]).norm(dim=1).max()) <= 1e-9 * max(1.0, float(centers.abs().max())):
@@ -254,7 +258,7 @@ def check_trainable(scene: Scene) -> None:
 
 
 def check_same_run(old: RunConfiguration, new: RunConfiguration, out: Path) -> None:
-    """Check that a run is resumed with the scene, recipe and settings of its training.
+    """Check that a run is resumed with the scene, recipe and settings with which it was started.
 
     Raises:
         PolarguideError: a value differs.
@@ -282,7 +286,7 @@ def check_same_run(old: RunConfiguration, new: RunConfiguration, out: Path) -> N
 
 
 def _check_state(state: TrainingState, settings: ResolvedSettings, out: Path) -> None:
-    """Check that a checkpoint belongs to the settings of its run."""
+    """Check that a checkpoint matches the settings of its run."""
     check_step(state.step, settings, out)
     sums = state.extra["statistics.gradient"]
     views = sums.shape[0] if sums.ndim == 2 else 1
@@ -296,7 +300,7 @@ def _check_state(state: TrainingState, settings: ResolvedSettings, out: Path) ->
 
 
 def check_step(step: int, settings: ResolvedSettings, out: Path) -> None:
-    """Check that a checkpoint's step belongs to the training.
+    """Check that the step of a checkpoint is not beyond the last step of the training.
 
     Raises:
         PolarguideError: the step is beyond the last one.
@@ -316,7 +320,7 @@ def _go_back(
     """Return to the last step that searches for metals, so that painted materials have an effect.
 
     Args:
-        state: state of the training, which is changed; None: it has not begun.
+        state: state of the training, which is changed in place. None if the training has not begun.
 
     Raises:
         PolarguideError: the recipe does not use materials, or the training is too short.
@@ -339,7 +343,7 @@ def _go_back(
 
 
 def ignored_filters(recipe: str) -> str:
-    """Return the warning that a recipe treats single pictures through a filter as photographs."""
+    """Return the warning for a recipe that treats pictures through a filter as photographs without a filter."""
     return (
         f"the recipe {recipe} has no term for single pictures through a filter and treats them as photographs "
         "without a filter."

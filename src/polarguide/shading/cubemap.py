@@ -46,7 +46,10 @@ _FACES = (
 
 
 def _face_points(coordinates: Tensor, distance: int) -> Tensor:
-    """Return points [6, n, n, 3] on extended faces at ``distance`` from the center, for coordinates [n] of s and t."""
+    """Return points [6, n, n, 3] in the planes of the faces, for coordinates [n] of s and t.
+
+    The planes are at ``distance`` from the center, and coordinates may lie beyond the edges of a face.
+    """
     t, s = torch.meshgrid(coordinates, coordinates, indexing="ij")
     points = torch.empty(6, *s.shape, 3, dtype=coordinates.dtype)
     for face, (axis, sign, s_axis, s_sign, t_axis, t_sign) in enumerate(_FACES):
@@ -63,12 +66,14 @@ def texel_directions(resolution: int) -> Tensor:
 
 
 class _Ring(NamedTuple):
-    """Indices into texels [6, R, R] of the faces with a ring of neighboring texels, [6, R + 2, R + 2].
+    """Index tables that surround each face of texels [6, R, R] with a ring of neighboring texels.
+
+    The result of these tables is [6, R + 2, R + 2].
 
     Attributes:
-        source: [6 (R + 2)^2] texel of each place; at a corner the face's own corner texel.
+        source: [6 (R + 2)^2] index of the texel at each place. At a corner it is the corner texel of the face itself.
         corners: [24] places of the corners.
-        around: [24, 3] texels that meet at each corner.
+        around: [24, 3] indices of the texels that meet at each corner.
     """
 
     source: Tensor
@@ -88,7 +93,7 @@ def _texel_index(face: Tensor, points: Tensor, resolution: int) -> Tensor:
 
 @lru_cache(maxsize=8)
 def _ring(resolution: int, device: torch.device) -> _Ring:
-    """Return the ring: beyond an edge lies the texel that touches the edge on the neighboring face."""
+    """Return the index tables. Beyond an edge lies the texel of the neighboring face that touches the edge."""
     last = resolution - 1
     place = 2 * torch.arange(-1, resolution + 1) - last  # half texels from the middle of a face
     inner = place.clamp(-last, last)
@@ -119,7 +124,10 @@ def _face_table(device: torch.device) -> Tensor:
 
 
 def face_coordinates(directions: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return face [P], s and t [P] in [-1, 1] of directions [P, 3]; ties go to the first axis, zero to +x's center."""
+    """Return the face [P] that directions [P, 3] meet, and the coordinates s and t [P] in [-1, 1] on it.
+
+    Ties between axes go to the first axis. A zero direction meets the center of the face +x.
+    """
     x, y, z = directions.abs().unbind(-1)
     axis = torch.where((x >= y) & (x >= z), 0, torch.where(y >= z, 1, 2))
     major = directions.gather(-1, axis[:, None])[:, 0]
@@ -149,7 +157,8 @@ def ringed_lookup(
     Args:
         ringed: [T, C] texels of one or several cubemaps.
         place: face, s and t of ``face_coordinates``, each [P].
-        resolution: R, a number or [P] int64. begin: first texel of the cubemap in ``ringed``, a number or [P] int64.
+        resolution: R, a number or [P] int64.
+        begin: index of the first texel of the cubemap in ``ringed``, a number or [P] int64.
 
     Returns:
         [P, C].
@@ -196,18 +205,18 @@ class _Lookup(torch.autograd.Function):
 
 
 def cubemap_lookup(texture: Tensor, directions: Tensor) -> Tensor:
-    """Look up a cubemap seamlessly and bilinearly: ``sum_k w_k(direction) texel_k`` over four taps.
+    """Look up a cubemap by bilinear interpolation without seams: ``sum_k w_k(direction) texel_k`` over four texels.
 
     The gradient with respect to a direction is the gradient of the weights. It is orthogonal to the direction, and
-    jumps between cells of four texel centers. A direction of length zero reads the middle of +x and gets no gradient.
-    A NaN in a direction returns NaN.
+    discontinuous where the four texels change. A direction of length zero reads the middle of the face +x and gets no
+    gradient. A NaN in a direction gives NaN.
 
     Args:
         texture: [6, R, R, C], R at least 1; see the module for the faces.
         directions: [P, 3], of any length.
 
     Returns:
-        [P, C], differentiable in both. On the CPU the number of threads does not change a bit.
+        Values [P, C], differentiable in texture and directions. On the CPU they do not depend on the number of threads.
 
     Raises:
         ValueError: a shape does not fit.
@@ -236,8 +245,8 @@ MOST_CHANNELS = 64
 def box_mips(texture: Tensor) -> list[Tensor]:
     """Return a cubemap and its box-filtered levels.
 
-    Each level averages 2 x 2 texels of the previous level within a face. After the level with one texel per face comes
-    the mean of all texels, which does not depend on the direction.
+    Each level averages 2 x 2 texels of the previous level within a face. The last level but one has one texel per face.
+    The last level is the mean of all texels, which does not depend on the direction.
 
     Args:
         texture: [6, R, R, C], R a power of two.
@@ -296,8 +305,9 @@ def mips_backward(
 
     Args:
         levels, directions, level: inputs of the look-up, contiguous.
-        grad: [P, C] gradient with respect to its result. textures: whether to compute gradients of the textures.
-        grad_light: [P, C] gradient used instead of ``grad`` for all but the directions.
+        grad: [P, C] gradient with respect to the result of the look-up.
+        textures: True to compute gradients with respect to the textures.
+        grad_light: [P, C] gradient that replaces ``grad`` for the level and the textures.
     """
     to_directions = torch.empty_like(directions)
     if len(levels) == 1:
@@ -319,9 +329,9 @@ def mips_backward(
 
 
 def mip_lookup(levels: Sequence[Tensor], directions: Tensor, level: Tensor) -> Tensor:
-    """Look up the two nearest mip levels seamlessly and bilinearly, and interpolate linearly between them.
+    """Look up the two nearest mip levels without seams, and interpolate linearly between them.
 
-    On the CPU in float32 a native pass serves up to 16 levels and 64 channels. The gradient with respect to ``level``
+    In float32 on the CPU, a native pass supports up to 16 levels and 64 channels. The gradient with respect to ``level``
     is the difference of the two levels, and 0 beyond the ends.
 
     Args:
@@ -330,7 +340,7 @@ def mip_lookup(levels: Sequence[Tensor], directions: Tensor, level: Tensor) -> T
         level: [P], clamped to [0, L - 1].
 
     Returns:
-        [P, C], differentiable in all three. On the CPU the number of threads does not change a bit.
+        Values [P, C], differentiable in all arguments. On the CPU they do not depend on the number of threads.
     """
     native = len(levels) <= MOST_LEVELS and 1 <= levels[0].shape[-1] <= MOST_CHANNELS
     if native and fits(directions, level, *levels):
@@ -341,7 +351,7 @@ def mip_lookup(levels: Sequence[Tensor], directions: Tensor, level: Tensor) -> T
 
 @lru_cache(maxsize=8)
 def _sizes(resolutions: tuple[int, ...], device: torch.device) -> tuple[Tensor, Tensor]:
-    """Return the resolutions of levels and the first of their ringed texels, both [L] int64."""
+    """Return the resolution of each level, and the index of its first ringed texel, both [L] int64."""
     counts = [6 * (resolution + 2) ** 2 for resolution in resolutions]
     begins = [sum(counts[:level]) for level in range(len(counts))]
     return torch.tensor(resolutions, device=device), torch.tensor(begins, device=device)

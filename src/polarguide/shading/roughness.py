@@ -1,6 +1,6 @@
-"""Blur of reflections: mip levels of the environment, and the roughness that a renderer needs for the same blur.
+"""Blur of reflections by mip levels of the environment, and the equivalent roughness for other renderers.
 
-A Gaussian's blur b in [0, 1] stands for level ``LEVELS b`` of the box-filtered radiance. A pixel has the mean blur of
+The blur b of a Gaussian, in [0, 1], selects the level ``LEVELS b`` of the box-filtered radiance. A pixel has the mean blur of
 its Gaussians. A level blurs like the GGX lobe (Walter et al. 2007) whose full width at half maximum equals the width
 of the level's texels. For narrow lobes that width is 147 degrees times alpha, so with R texels along a face's side
 
@@ -28,10 +28,13 @@ def light_levels(radiance: Tensor) -> list[Tensor]:
 
 
 def ggx_alpha(blur: Tensor, resolution: int) -> Tensor:
-    """Return alpha of GGX for a blur in [0, 1] and ``resolution`` texels along a face's side."""
+    """Return the alpha of GGX that gives a blur in [0, 1], for ``resolution`` texels along the side of a face."""
     return torch.exp2(LEVELS * blur) * (90 / resolution / LOBE_WIDTH)
 
 
 def gltf_roughness(blur: Tensor, resolution: int) -> Tensor:
-    """Return the roughness of glTF, the square root of GGX's alpha, for a blur in [0, 1]; without a gradient."""
+    """Return the roughness of glTF that gives a blur in [0, 1], without a gradient.
+
+    It is the square root of the alpha of GGX.
+    """
     return ggx_alpha(blur.detach(), resolution).sqrt()

@@ -13,12 +13,12 @@ from polarguide.gaussians.gaussians import Parameters, any_nonzero
 
 
 class Parameter(NamedTuple):
-    """Tensor that a shading model trains.
+    """Description of a tensor that a shading model adds to the training.
 
     Attributes:
         shape: shape of the values of one Gaussian, or of the whole tensor for a parameter of the light.
-        rate: learning rate of Adam; with 0 the tensor keeps its first values.
-        reset_minimum: lower bound of the values after a reset of the opacities; None: no bound.
+        rate: learning rate of Adam. With 0 the tensor keeps its first values.
+        reset_minimum: lower bound of the values after a reset of the opacities. None means no bound.
     """
 
     shape: tuple[int, ...]
@@ -31,9 +31,9 @@ class GltfTexture:
     """Texture of a glTF material that holds a surface property.
 
     Attributes:
-        extension: name of the material extension that has the texture.
+        extension: name of the glTF extension that defines the texture.
         texture: name of the texture in the extension.
-        constants: further entries of the extension, such as the factor of the texture.
+        constants: other entries of the extension, such as the factor of the texture.
     """
 
     extension: str
@@ -47,20 +47,23 @@ def _identity(values: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class SurfaceProperty:
-    """Property of surfaces, from its parameter to exported files.
+    """Surface property of a shading model, such as its reflection strength.
+
+    It describes how the property is learned, blended per pixel, and exported to files.
 
     Attributes:
-        name: name of the splatted channels, of the layer and of the field in files.
+        name: name of the property in splatted channels, layers and files.
         parameter: name of the per-Gaussian tensor.
         channels: number of values of a Gaussian.
         activation: function from the raw numbers of the parameter to values.
         inverse: function from values to raw numbers.
         initial: value before the first step.
-        rate: learning rate of the parameter; with 0 it is not learned.
-        reset_minimum: lower bound of the raw numbers after a reset of the opacities; None: no bound.
-        gltf: texture of a GLB that holds the property, with values in [0, 1]; None: no texture.
-        weight: name of a parameter that is not learned and multiplies the splatted values. If it is 0 everywhere, the
-            property is not splatted. The property's own parameter multiplies nothing. "": no weight.
+        rate: learning rate of the parameter. With 0 it is not learned.
+        reset_minimum: lower bound of the raw numbers after a reset of the opacities. None means no bound.
+        gltf: texture of a GLB file that holds the property, with values in [0, 1]. None means no texture.
+        weight: name of an untrained parameter by which the values are multiplied before they are splatted. If it is 0
+            for all Gaussians, the property is not splatted. If it names the property's own parameter, values are not
+            multiplied. An empty name means no weight.
     """
 
     name: str
@@ -89,7 +92,7 @@ class SurfaceProperty:
         return self.activation(gaussians[self.parameter])
 
     def splatted(self, gaussians: Parameters) -> Tensor | None:
-        """Return the splatted values [N, channels]; None if the weight is 0 everywhere."""
+        """Return the values to splat, [N, channels], or None if the weight is 0 for all Gaussians."""
         if self.weight and not any_nonzero(gaussians, self.weight):
             return None
         values = self.values(gaussians).reshape(-1, self.channels)
@@ -99,6 +102,9 @@ class SurfaceProperty:
 
 
 def surface_channels(properties: Iterable[SurfaceProperty], gaussians: Parameters) -> dict[str, Tensor]:
-    """Return the splatted values [N, C] of surface properties by name, without those whose weight is 0 everywhere."""
+    """Return the values [N, C] to splat for each surface property, by name.
+
+    Properties whose weight is 0 for all Gaussians are left out.
+    """
     channels = {row.name: row.splatted(gaussians) for row in properties}
     return {name: values for name, values in channels.items() if values is not None}

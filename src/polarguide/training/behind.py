@@ -1,4 +1,4 @@
-"""Fading of gradients that move Gaussians far behind the subject."""
+"""Reduction of gradients that move Gaussians far behind the subject."""
 
 from __future__ import annotations
 
@@ -9,14 +9,15 @@ from polarguide.shading.result import RenderResult
 
 
 def fade_behind(result: RenderResult, near: float, far: float) -> RenderResult:
-    """Return the same layers with gradients of normal and depth that move no far Gaussian.
+    """Return the same layers, but let the gradients of normal and depth not move distant Gaussians.
 
-    Up to ``near``, gradients of the normal and the depth reach all parameters. From there they fade linearly in inverse
-    depth. From ``far`` on, the depth has no gradient, and that of the normal only turns Gaussians. A pixel is as far
-    away as the farthest of its 3 x 3 neighbors, because normals of the depth are differences between these.
+    At depths up to ``near``, gradients of the normal and the depth reach all parameters. Between ``near`` and ``far``
+    they fade linearly in inverse depth. Beyond ``far``, the depth has no gradient, and the gradient of the normal only
+    rotates Gaussians. The largest depth among the 3 x 3 neighbors of a pixel decides, because depth normals are
+    differences between these neighbors.
 
     Args:
-        result: with ``normal``, ``rotation_only_normal`` and ``depth``.
+        result: rendering with ``normal``, ``rotation_only_normal`` and ``depth``.
         near, far: camera depths, 0 < near < far.
     """
     depth = result.depth.detach()
@@ -32,7 +33,7 @@ def shares_before(depth: Tensor, near: float, far: float) -> Tensor:
 
 
 def _largest_of_three(values: Tensor) -> Tensor:
-    """Return the maximum of each row and its two neighbors, [H, W]; many times as fast as pooling."""
+    """Return the maximum of each row and its two neighbors, [H, W]. This is much faster than pooling."""
     largest = values.clone()
     torch.maximum(values[1:], values[:-1], out=largest[1:])
     torch.maximum(largest[:-1], values[1:], out=largest[:-1])

@@ -16,15 +16,17 @@ from polarguide.training.state import SavedState
 from polarguide.training.targets import Step
 
 LoopKind = TypeVar("LoopKind", contravariant=True)
-"""Kind of the loop whose steps a callback accompanies."""
+"""Type of the loop for which a callback runs."""
 
 
 class Callback(Generic[LoopKind]):
-    """Base class of callbacks; every method of this class does nothing.
+    """Base class of callbacks, which run between the steps of a training. The methods of this class do nothing.
 
     Attributes:
-        name: name of its tensors in a checkpoint, an identifier; unique among the callbacks that have a state.
-        action: name in ``Stage.on_enter``, ``Repeat`` and ``Rounds`` of a recipe that makes ``act`` due.
+        name: identifier that names the tensors of the callback in a checkpoint. It must be unique among the callbacks
+            with a state.
+        action: name of an action. ``act`` runs where ``Stage.on_enter``, ``Repeat`` or ``Rounds`` of a recipe contain
+            this name.
     """
 
     name = ""
@@ -32,7 +34,7 @@ class Callback(Generic[LoopKind]):
 
     @property
     def prefix(self) -> str:
-        """Prefix of the names of its tensors in a checkpoint."""
+        """Prefix of the names of the callback's tensors in a checkpoint."""
         return f"callback.{self.name}."
 
     def begin(self, loop: LoopKind) -> None:
@@ -42,7 +44,7 @@ class Callback(Generic[LoopKind]):
         """Run before a step, and before the actions that are due."""
 
     def act(self, loop: LoopKind) -> None:
-        """Run where the recipe names ``action``. Callbacks of one action follow each other in their order."""
+        """Perform the action. Several callbacks with the same action run in the order of the callbacks."""
 
     def after_backward(self, loop: LoopKind, step: Step, slot: int) -> None:
         """Run after the gradients of one view of a step have been added; ``slot`` is the number of that view."""
@@ -68,16 +70,18 @@ AnyCallback = Callback[Any]
 
 
 class Loop(ABC):
-    """Steps of a training, with callbacks between them.
+    """Base class of training loops: it runs steps, and callbacks between them.
 
     Attributes:
         settings: settings of the training.
         ranks: processes that share the training.
         callbacks: callbacks in the order of their calls.
-        observers: callbacks that run after the others, when the step is complete. They change nothing.
+        observers: callbacks that run after all other callbacks, when the step is complete. They do not change the
+            state.
         state: state between two steps.
-        whole: False while an exception would leave the state in the middle of a change.
-        total: number of steps in all. offset: number of steps before the current schedule began.
+        whole: False during a change of the state that an exception would leave incomplete.
+        total: number of steps of all schedules.
+        offset: number of steps before the current schedule began.
     """
 
     state: SavedState
@@ -118,18 +122,18 @@ class Loop(ABC):
         return report
 
     def prepare(self) -> None:  # noqa: B027
-        """Do the work that is due before a step."""
+        """Run the work that is due before a step."""
 
     @abstractmethod
     def optimize(self) -> tuple[Tensor, str, int | None]:
-        """Change the parameters once.
+        """Update the parameters once.
 
         Returns:
-            ``StepReport.measured``, the name of the stage, and the number of Gaussians.
+            A tuple of ``StepReport.measured``, the name of the stage, and the number of Gaussians.
         """
 
     def saved_state(self) -> SavedState:
-        """Return the state for a checkpoint, with the sums of all ranks. Every rank calls it."""
+        """Return the state for a checkpoint, with the sums of all ranks. Every rank has to call it."""
         for callback in self.callbacks:
             callback.before_checkpoint(self)
         return self.state
@@ -139,7 +143,7 @@ def stateful(callbacks: Iterable[AnyCallback]) -> list[AnyCallback]:
     """Return the callbacks that have a state.
 
     Raises:
-        PolarguideError: one of them has no name of its own for its tensors in a checkpoint.
+        PolarguideError: a callback has no unique name for its tensors in a checkpoint.
     """
     holders = [each for each in callbacks if type(each).state_dict is not Callback.state_dict]
     names = [each.name for each in holders]
@@ -155,7 +159,7 @@ def stateful(callbacks: Iterable[AnyCallback]) -> list[AnyCallback]:
 
 
 def check_known(kind: str, names: Iterable[str], known: set[str]) -> None:
-    """Check that the callbacks of a loop define all names of a kind.
+    """Check that the callbacks of a loop define all given names, such as the actions of a recipe.
 
     Raises:
         PolarguideError: one name is unknown.

@@ -1,4 +1,4 @@
-"""Callbacks of the training of Gaussians that belong to a method, and the changes of Gaussians that they make."""
+"""Callbacks that belong to the method of training Gaussians, and functions that change Gaussians for them."""
 
 from __future__ import annotations
 
@@ -34,9 +34,10 @@ def _logit(value: float) -> float:
 
 @torch.no_grad()
 def reset_opacity(state: TrainingState, shading: ShadingModel, most: float) -> None:
-    """Lower opacities to at most ``most``, so that unneeded Gaussians stay transparent (Kerbl et al. 2023).
+    """Lower opacities to at most ``most`` (Kerbl et al. 2023).
 
-    Parameters of the shading model rise to their minimum after a reset, if they have one.
+    Useful Gaussians become opaque again, and unneeded Gaussians stay transparent. Parameters of the shading model with
+    a ``reset_minimum`` are raised to it.
     """
     gaussians = state.gaussians
     gaussians.overwrite("opacity_logits", gaussians["opacity_logits"].clamp(max=_logit(most)))
@@ -53,15 +54,15 @@ def propagate_normals(
     generator: torch.Generator,
     steps: int,
 ) -> None:
-    """Let Gaussians with a right normal take over their neighborhood (Ye et al. 2024, Sec. 3.3).
+    """Spread Gaussians with a correct normal over their neighborhood (Ye et al. 2024, Sec. 3.3).
 
-    Opacities rise. Matte Gaussians get noise on their color, which hides the light that they explain by color alone.
-    Glossy Gaussians grow along their surface.
+    All opacities are raised. Matte Gaussians get noise on their color, which hides reflections that they reproduce by
+    their color alone. Glossy Gaussians grow along their surface.
     """
     gaussians = state.gaussians
     strength = shading.strength(gaussians)
     gaussians.overwrite("opacity_logits", gaussians["opacity_logits"].clamp(min=_logit(settings.opacity)))
-    # Drawn on the CPU: the noise is the same on every device.
+    # The noise is drawn on the CPU, so that it is the same on every device.
     noise = (torch.rand(gaussians["sh_dc"].shape, generator=generator) * 2 - 1) * settings.color_noise
     noise = noise.to(gaussians["sh_dc"].device)
     matte = (strength <= settings.matte)[:, None]
@@ -75,15 +76,15 @@ def propagate_normals(
 
 
 DEPTH_SLACK = 0.02
-"""Largest distance of a visible Gaussian behind the rendered surface, relative to its depth."""
+"""Largest distance by which a visible Gaussian may lie behind the rendered depth, as a share of this depth."""
 LEAST_PIXELS = 0.05
-"""Least sum of the blending weights of a Gaussian that contributes to a picture."""
+"""Least sum of the blending weights with which a Gaussian counts as contributing to a picture."""
 DEPTH_ALONE = RenderRequest(sh_degree=0, normals=False, depth=True)
 
 
 @torch.no_grad()
 def outward_directions(gaussians: Parameters, views: Iterable[View], rasterize: Rasterize) -> Tensor:
-    """Return the sum of the unit directions to the cameras that see each Gaussian.
+    """Sum, for each Gaussian, the unit directions to all cameras that see it.
 
     A camera sees a Gaussian if its center is inside the picture and not behind the rendered depth.
 
@@ -93,7 +94,7 @@ def outward_directions(gaussians: Parameters, views: Iterable[View], rasterize: 
         rasterize: rasterizer of the backend.
 
     Returns:
-        [N, 3]; zero for Gaussians that no camera sees.
+        Sums [N, 3], zero for Gaussians that no camera sees.
     """
     means = gaussians["means"]
     total = torch.zeros_like(means)
@@ -108,11 +109,11 @@ def outward_directions(gaussians: Parameters, views: Iterable[View], rasterize: 
 
 
 class PixelCounts(NamedTuple):
-    """Pixels of each Gaussian in training pictures.
+    """Number of pixels to which each Gaussian contributes in training pictures.
 
     Attributes:
         views: [N] float32, number of pictures in which the sum of its blending weights is at least ``LEAST_PIXELS``.
-        most: [N] largest sum of its blending weights in a picture, in pixels.
+        most: [N] largest sum of its blending weights in any picture. An opaque Gaussian that covers one pixel has 1.
     """
 
     views: Tensor
@@ -120,7 +121,7 @@ class PixelCounts(NamedTuple):
 
 
 def touched_pixels(gaussians: Parameters, cameras: Iterable[Camera], rasterize: Rasterize) -> PixelCounts:
-    """Count the pixels of each Gaussian in pictures.
+    """Count the pixels to which each Gaussian contributes.
 
     Args:
         gaussians: the Gaussians.
@@ -143,7 +144,7 @@ def touched_pixels(gaussians: Parameters, cameras: Iterable[Camera], rasterize: 
 
 
 class LargeBatch(Callback[TrainingLoop]):
-    """Decay and rates of Adam for several views a step; see ``TrainSettings``."""
+    """Callback that adapts the decay and the rates of Adam to the number of views per step, see ``TrainSettings``."""
 
     def begin(self, loop: TrainingLoop) -> None:
         views = loop.settings.views_per_step
@@ -157,7 +158,7 @@ class LargeBatch(Callback[TrainingLoop]):
 
 
 class OpacityReset(Callback[TrainingLoop]):
-    """Reset of the opacities to a small value."""
+    """Callback that resets the opacities to a small value."""
 
     action = "reset_opacity"
 
@@ -167,7 +168,7 @@ class OpacityReset(Callback[TrainingLoop]):
 
 
 class NormalPropagation(Callback[TrainingLoop]):
-    """Spread of Gaussians with a right normal over their neighborhood."""
+    """Callback that spreads Gaussians with a correct normal over their neighborhood."""
 
     action = "propagate_normals"
 
@@ -187,7 +188,7 @@ class NormalPropagation(Callback[TrainingLoop]):
 
 
 class NormalOrientation(Callback[TrainingLoop]):
-    """Search for the side of each Gaussian that training views see."""
+    """Callback that determines the side from which training views see each Gaussian."""
 
     action = "orient_normals"
 
@@ -201,7 +202,7 @@ class NormalOrientation(Callback[TrainingLoop]):
 
 
 class Metals(Callback[TrainingLoop]):
-    """Search for metals at refreshes of the priors."""
+    """Callback that searches for metals when the priors are refreshed."""
 
     action = "refresh_priors"
 
@@ -215,7 +216,7 @@ class Metals(Callback[TrainingLoop]):
 
 
 class IndexOffsets(Callback[TrainingLoop]):
-    """Assignment of the refractive indices that the user specified for materials."""
+    """Callback that assigns to Gaussians the refractive indices that the user specified for materials."""
 
     action = "refresh_priors"
 
@@ -239,7 +240,10 @@ class IndexOffsets(Callback[TrainingLoop]):
 
 
 class PriorRefresh(Callback[TrainingLoop]):
-    """Recomputation of the priors of all views with the normals of a copy of the Gaussians, the guide."""
+    """Callback that has the priors of all views recomputed.
+
+    The normals of a copy of the Gaussians, the guide, resolve the ambiguities of polarization in these priors.
+    """
 
     action = "refresh_priors"
     name = "prior_refresh"
@@ -249,7 +253,7 @@ class PriorRefresh(Callback[TrainingLoop]):
         self._guide = dict[str, Tensor]()
 
     def before_step(self, loop: TrainingLoop, position: Position) -> None:
-        """Request a refresh if the step needs priors and none has been made."""
+        """Request a refresh if the step needs priors and there was no refresh before."""
         loop.feed.guide = self._guide
         if self._guide or not position.stage.weights.priors or self.action in position.actions:
             return
@@ -270,7 +274,10 @@ class PriorRefresh(Callback[TrainingLoop]):
 
 
 class DensityControl(Callback[TrainingLoop]):
-    """Addition and removal of Gaussians in stages with density control, by the statistics of all ranks."""
+    """Callback that adds and removes Gaussians in stages with density control.
+
+    The decisions depend on the statistics of all ranks.
+    """
 
     prefix = "statistics."
     name = "density_control"
@@ -318,7 +325,7 @@ class DensityControl(Callback[TrainingLoop]):
             self._prune_untouched(loop)
 
     def before_checkpoint(self, loop: TrainingLoop) -> None:
-        """Exchange the sums since the last densification among the ranks."""
+        """Exchange the statistics since the last densification among the ranks."""
         for sums in self.state_dict().values():
             loop.ranks.exchange_slots(sums if sums.ndim == 2 else sums[None])
 
@@ -331,8 +338,8 @@ class DensityControl(Callback[TrainingLoop]):
     def _prune_untouched(self, loop: TrainingLoop) -> None:
         """Remove Gaussians that contribute too little to the training views.
 
-        Without a background, Gaussians in too few training views are removed, because they are fog in new views.
-        Gaussians that are fainter in all training views than the recipe's limit are removed as well.
+        If the scene has no background, Gaussians that only few training views show are removed, because they appear as
+        fog in new views. Gaussians that are fainter in all training views than the recipe's limit are also removed.
         """
         context = loop.current
         density = context.recipe.densification
@@ -353,7 +360,7 @@ class DensityControl(Callback[TrainingLoop]):
 
 
 class Footprints(Callback[TrainingLoop]):
-    """Measurement of the size of a training pixel at each Gaussian after the last step."""
+    """Callback that computes the size of a training pixel at each Gaussian after the last step."""
 
     def at_end(self, loop: TrainingLoop) -> None:
         cameras = (view.camera for view in loop.current.views)
@@ -361,7 +368,7 @@ class Footprints(Callback[TrainingLoop]):
 
 
 def method_callbacks() -> list[AnyCallback]:
-    """Return the callbacks of a training of Gaussians, in their order."""
+    """Return the callbacks of a training of Gaussians, in the order in which they run."""
     return [
         LargeBatch(),
         OpacityReset(),

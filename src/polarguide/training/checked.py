@@ -1,6 +1,6 @@
-"""Checks of a checkpoint: every tensor is checked before a computation reads it.
+"""Checks of all tensors of a checkpoint before a computation reads them.
 
-The kernels and the fused optimizer trust the shapes, so that a tensor of another shape would be read beyond its end. A
+The kernels and the fused optimizer do not check shapes. They would read beyond the end of a tensor of a wrong shape. A
 value that is not finite would lead to an empty picture.
 """
 
@@ -19,9 +19,9 @@ from polarguide.training.state import ANGLE_COLUMNS
 LARGEST_VALUE = 1e8
 """Largest absolute value of a parameter without a range of its own."""
 RANGES = {"means": (-1e12, 1e12), "log_scales": (-1e4, 60.0)}
-"""Ranges of parameters."""
+"""Allowed ranges of parameters by name."""
 MOST_SLOTS = 4096
-"""Largest number of views a step."""
+"""Largest number of views per step."""
 MOST_STEPS = 1 << 50
 """Largest number of steps."""
 
@@ -51,10 +51,10 @@ class TensorRule:
 
 
 def check_tensors(tensors: Mapping[str, Tensor], rules: Mapping[str, TensorRule]) -> None:
-    """Check that tensors are those of the rules, and no others.
+    """Check that each tensor has a rule and satisfies it, and that no tensor is missing.
 
     Raises:
-        ValueError: one is missing, is unknown, or has another shape, type or range; the message names it.
+        ValueError: a tensor is missing, is unknown, or has a wrong shape, type or range; the message names it.
     """
     for name, rule in rules.items():
         rule.check(name, _tensor(tensors, name))
@@ -64,7 +64,7 @@ def check_tensors(tensors: Mapping[str, Tensor], rules: Mapping[str, TensorRule]
 
 
 def moment_rules(tensors: Mapping[str, Tensor], prefix: str, shape: tuple[int, ...]) -> dict[str, TensorRule]:
-    """Return the rules of Adam's moments of a tensor of this shape; none if no moment is stored."""
+    """Return the rules for the moments of Adam of a tensor with this shape; empty if no moment is stored."""
     rules = {
         "step": TensorRule((), 0.0),
         "exp_avg": TensorRule(shape),
@@ -77,11 +77,11 @@ def moment_rules(tensors: Mapping[str, Tensor], prefix: str, shape: tuple[int, .
 def refuse_foreign(tensors: Mapping[str, Tensor], recipe: Recipe) -> None:
     """Check that tensors belong to a training of the recipe.
 
-    Shapes are those of the recipe and its shading model. The copy from which priors are computed may have another
-    number of Gaussians. Callbacks of the user check their own tensors.
+    The recipe and its shading model determine the shapes. The copy of the Gaussians from which priors are computed may
+    have a different number of Gaussians. Callbacks of the user check their own tensors.
 
     Raises:
-        ValueError: one is missing, is unknown, or has another shape, type or range; the message names it.
+        ValueError: a tensor is missing, is unknown, or has a wrong shape, type or range; the message names it.
     """
     count = _count(tensors, "gaussians.means")
     light = {name: parameter.shape for name, parameter in recipe.shading.light_parameters.items()}
@@ -131,7 +131,7 @@ def _count(tensors: Mapping[str, Tensor], name: str) -> int:
 
 
 def _statistics_shape(tensors: Mapping[str, Tensor], count: int) -> tuple[int, ...]:
-    """Return the shape of the sums of the density control: [N], or [S, N] for S views a step."""
+    """Return the shape of the sums of the density control: [N], or [S, N] for S views per step."""
     shape = tuple(_tensor(tensors, "statistics.gradient").shape)
     if shape == (count,) or (len(shape) == 2 and shape[1] == count and 1 < shape[0] <= MOST_SLOTS):
         return shape

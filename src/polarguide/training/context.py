@@ -25,7 +25,7 @@ from polarguide.training.storage import ViewStore
 
 @dataclass(frozen=True, eq=False)
 class TrainingContext:
-    """Inputs and services of a training.
+    """Inputs and services that a training uses in all its steps.
 
     Attributes:
         scene: the capture.
@@ -34,8 +34,8 @@ class TrainingContext:
         backend: device and rasterizer.
         ranks: the processes that share the views of each step.
         store: cache of computed targets of the views.
-        memory: returns freed memory to the system.
-        reporter: receives messages for the user.
+        memory: object that returns freed memory to the system.
+        reporter: object that receives messages for the user.
     """
 
     scene: Scene
@@ -64,7 +64,7 @@ class TrainingContext:
 
     @cached_property
     def reach(self) -> float:
-        """Distance of the cameras from the middle of the points; nine tenths are nearer."""
+        """Distance from the middle of the points that nine tenths of the cameras do not exceed."""
         return self._region[1]
 
     @cached_property
@@ -83,5 +83,5 @@ class TrainingContext:
 
     @property
     def black(self) -> bool:
-        """True if nothing is behind the subject."""
+        """True if the subject has no background."""
         return self.settings.background != "scene"

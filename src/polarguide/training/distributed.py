@@ -1,8 +1,8 @@
-"""Processes of one training, started by torchrun: shares of views, sums of results, and loss of a process.
+"""Training in several processes that torchrun starts: distribution of views, sums of results, and lost processes.
 
-A step renders B views in its slots 0 to B - 1. Each rank takes a range of them. Sums over slots are computed in the
-order of the ranks, for every communication backend, so that two processes of one view each give the bits of one process
-of two.
+A step renders B views in slots 0 to B - 1. Each rank renders a range of slots. Sums over slots are added in the order
+of the ranks, with every communication backend. Two processes with one view each therefore compute exactly the same
+result as one process with two views.
 """
 
 from __future__ import annotations
@@ -42,12 +42,12 @@ TIMEOUT = timedelta(minutes=30)
 
 
 class LostRank(Exception):
-    """Another rank does not take part any more."""
+    """Error that is raised if another rank has ended."""
 
 
 @contextlib.contextmanager
 def _collective() -> Iterator[None]:
-    """Convert a failed collective to LostRank; every backend raises another exception."""
+    """Raise LostRank if a collective fails; communication backends raise different exceptions."""
     try:
         yield
     except RuntimeError as error:
@@ -55,13 +55,15 @@ def _collective() -> Iterator[None]:
 
 
 def _gather(into: Tensor, own: Tensor) -> None:
-    """Gather the tensors ``own`` of all ranks; newer versions of torch have a new name for it."""
+    """Gather the tensors ``own`` of all ranks into ``into``; torch's function has two names."""
     gather = getattr(dist, "all_gather_single", None) or dist.all_gather_into_tensor
     gather(into, own)
 
 
 class Ranks:
-    """One process alone; ``SeveralRanks`` overrides the methods that involve other processes.
+    """Communication of a training in a single process, which has nobody to communicate with.
+
+    ``SeveralRanks`` overrides the methods that involve other processes.
 
     Attributes:
         rank: number of this process.
@@ -72,7 +74,7 @@ class Ranks:
     world = 1
 
     def slots(self, views: int, rank: int | None = None) -> range:
-        """Return the slots of a step's ``views`` of a rank; the first ranks take the remainder."""
+        """Return the slots that a rank renders if a step has ``views`` views; the first ranks take the remainder."""
         rank = self.rank if rank is None else rank
         base, remainder = divmod(views, self.world)
         begin = rank * base + min(rank, remainder)
@@ -82,7 +84,7 @@ class Ranks:
         """Replace each tensor by its sum over the ranks, in their order."""
 
     def average(self, gradients: list[Tensor], views: int) -> None:
-        """Replace sums over the views of this rank by the mean over all ``views`` of a step."""
+        """Replace gradients summed over the views of this rank by the mean over all ``views`` of the step."""
         if views == 1 and self.world == 1:
             return
         if not self.slots(views):
@@ -92,10 +94,10 @@ class Ranks:
             torch._foreach_div_(gradients, float(views))
 
     def exchange_slots(self, sums: Tensor) -> None:
-        """Fill in the rows of [S, ...] of other ranks."""
+        """Fill in the rows that other ranks have computed, in a tensor [S, ...] with one row per slot."""
 
     def broadcast(self, tensor: Tensor) -> None:
-        """Replace a tensor by that of rank 0."""
+        """Replace a tensor by the tensor of rank 0."""
 
     def any(self, flag: bool) -> bool:
         """Return True if the flag is True on any rank."""
@@ -106,14 +108,17 @@ class Ranks:
 
 
 class SeveralRanks(Ranks):
-    """Ranks of the default process group, which has a backend for CPU tensors and may have one for a GPU."""
+    """Communication of a training in several processes, by the default process group.
+
+    The group has a backend for CPU tensors, and may have one for GPU tensors.
+    """
 
     def __init__(self) -> None:
         self.rank = dist.get_rank()
         self.world = dist.get_world_size()
 
     def all_reduce(self, tensors: Sequence[Tensor]) -> None:
-        """Sum one part of all tensors on each rank in the order of ranks, and distribute the sums."""
+        """Replace each tensor by its sum over the ranks; each rank adds one part of the tensors and distributes it."""
         if not tensors:
             return
         flat = torch.cat([t.reshape(-1) for t in tensors])
@@ -163,14 +168,14 @@ ALONE = Ranks()
 
 @contextlib.contextmanager
 def process_group(device: DeviceName, out: Path) -> Iterator[Ranks]:
-    """Join the process group of torchrun, if there is one, and leave it together.
+    """Join the process group of torchrun, if there is one, and leave it at the end of the context.
 
-    If a process is lost, the other processes of its machine end within seconds with status 1, and the first of them
-    reports it on stderr.
+    All processes leave the group together. If a process is lost, the other processes on its machine exit within seconds
+    with status 1. The first of them reports the loss on stderr.
 
     Args:
         device: device of the computation.
-        out: the run folder, for that message.
+        out: the run folder, which the message names.
 
     Raises:
         PolarguideError: a process is lost on another machine.
@@ -195,7 +200,7 @@ def process_group(device: DeviceName, out: Path) -> Iterator[Ranks]:
 
 
 def backend_of(ranks: Ranks, device: DeviceName, reporter: Reporter = SILENT) -> Backend:
-    """Return the backend of this rank; the first rank of a machine compiles kernels while the others wait."""
+    """Return the backend of this rank. The first rank of a machine compiles the kernels while the other ranks wait."""
     local = int(os.environ.get("LOCAL_RANK", "0")) if ranks.world > 1 else 0
     chosen = choose_backend(device, say=reporter.say) if local == 0 else None
     ranks.barrier()
@@ -212,9 +217,9 @@ def _loss(found: str, world: int, out: Path) -> PolarguideError:
 
 
 class _Monitor:
-    """Thread that checks the ranks of this machine, and ends this process when one is lost.
+    """Thread that checks the other ranks of this machine, and ends this process when a rank is lost.
 
-    A rank that waits for a lost one inside a collective cannot run signal handlers, so that a thread is needed.
+    A thread is needed because a rank that waits for a lost rank inside a collective cannot run signal handlers.
     """
 
     def __init__(self, ranks: SeveralRanks, out: Path) -> None:
@@ -240,5 +245,5 @@ class _Monitor:
                 os._exit(1)
 
     def stop(self) -> None:
-        """Stop the checks, so that processes may end."""
+        """Stop the checks before the processes end normally."""
         self._stop.set()

@@ -28,13 +28,16 @@ KINDS = ("photograph", "unguided", "priors")
 
 
 def is_complete(entry: Entry, fields: frozenset[str]) -> bool:
-    """Return True if an entry has all fields; either the normal or its candidates suffice."""
+    """Return True if an entry has all fields. The normal may be replaced by its candidates."""
     missing = fields - entry.keys()
     return not missing or (len(missing) == 1 and missing < {"normal", "candidates"})
 
 
 def pack_priors(priors: ViewPriors, fields: Collection[str]) -> Entry:
-    """Pack the requested fields of priors, and all fields that no built-in term reads."""
+    """Pack the requested fields of priors for the cache.
+
+    Fields that no built-in term reads are always packed.
+    """
     selected = {
         name: values
         for name, values in vars(priors).items()
@@ -47,10 +50,12 @@ def pack_priors(priors: ViewPriors, fields: Collection[str]) -> Entry:
 
 
 def unpack_priors(entry: Entry, camera: Camera, settings: Priors) -> ViewPriors:
-    """Return the priors of an entry; fields that it lacks are ``ABSENT``.
+    """Return the priors of a cache entry. Fields that the entry lacks are ``ABSENT``.
 
     Args:
-        entry: result of ``pack_priors``. camera: camera of the view. settings: settings of the priors.
+        entry: result of ``pack_priors``.
+        camera: camera of the view.
+        settings: settings of the priors.
     """
     values = {name: stored_values(stored) for name, stored in entry.items()}
     if "stokes" in values:
@@ -63,9 +68,9 @@ def unpack_priors(entry: Entry, camera: Camera, settings: Priors) -> ViewPriors:
 
 
 class Feed:
-    """Training views and their targets, in the resolution of each step.
+    """Source of the training views and their targets, in the resolution of each step.
 
-    For large pictures, the first steps use smaller ones, as specified by the recipe.
+    If pictures are large, the first steps use smaller copies, as the recipe specifies.
 
     Args:
         context: context of the training.
@@ -107,7 +112,7 @@ class Feed:
         return view if exposures == view.exposures else view.with_exposures(exposures)
 
     def set_exposures(self, exposures: Mapping[str, tuple[Exposure, ...]]) -> None:
-        """Replace the exposures of views, by name; their targets are computed again."""
+        """Replace the exposures of views, by the name of the view. The targets of these views are computed again."""
         self._exposures.update(exposures)
         for size, name in itertools.product(self._views, exposures):
             self._partial.pop((size, name), None)
@@ -179,7 +184,7 @@ class Feed:
             computed = unguided(view.to(normal.device), self._settings, self._index)._asdict()
             return {name: Packed(values) for name, values in computed.items() if values is not None}
 
-        # Disposable: it costs only a part of the priors, and is not worth a file.
+        # Disposable, because recomputing this part is cheap compared to the priors and not worth a file.
         entry = self._store.get(size + "unguided", view.name, make, disposable=True)
         precomputed = Unguided(**{name: part.codes for name, part in entry.items()})
         flat = self._flat_surfaces(size).get(view.name)
@@ -199,6 +204,6 @@ class Feed:
 
 
 def coarse_steps(recipe: Recipe, views: Sequence[View], steps: int) -> int:
-    """Return the number of steps at the beginning that use smaller pictures; 0 for small captures."""
+    """Return the number of first steps that use smaller pictures; 0 if all pictures are small."""
     largest = max((view.camera.width * view.camera.height for view in views), default=0)
     return round(recipe.coarse.share * steps) if largest > recipe.coarse.pixels else 0

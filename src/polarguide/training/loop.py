@@ -1,7 +1,7 @@
 """The training loop: schedule, targets, render, loss, step. Everything else is a callback.
 
-The loop contains no constant of a method. All that a step reads is on the device before it: a step without actions
-copies nothing there and waits for nothing.
+The loop contains no constant of a method. All data that a step reads are copied to the device in advance. A step
+without actions therefore copies nothing to the device and does not wait for it.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ class TrainingLoop(Loop):
 
     Args:
         context: context of the training.
-        callbacks: everything that happens between steps; see ``training.callbacks.method_callbacks``.
-        state: state to resume from, on the backend's device; None: from the beginning.
-        first: context of the schedule to begin with; None: ``context``.
+        callbacks: callbacks that run between steps; see ``training.callbacks.method_callbacks``.
+        state: state to resume from, on the device of the backend. None starts from the beginning.
+        first: context of the first schedule, such as a search for angles. With None, this is ``context``.
 
     Attributes:
         current: context of the current schedule: a search for angles, or ``context``.
@@ -58,11 +58,11 @@ class TrainingLoop(Loop):
         self.begin(first or context, state)
 
     def begin(self, context: TrainingContext, state: TrainingState | None) -> None:
-        """Begin with a schedule, or resume it from a state.
+        """Begin a schedule, or resume it from a state.
 
         Raises:
-            PolarguideError: a callback for an action of the recipe or for tensors of the state is missing, or a
-                callback with a state has no name of its own.
+            PolarguideError: no callback performs an action of the recipe, no callback holds a tensor of the state, or a
+                callback with a state has no unique name.
         """
         holders = stateful(self.callbacks)
         check_known("action", context.recipe.actions, {each.action for each in self.callbacks})
@@ -79,7 +79,7 @@ class TrainingLoop(Loop):
                 self.state.attach(callback)
 
     def prepare(self) -> None:
-        """Run the callbacks and actions before a step."""
+        """Run the callbacks and actions that are due before a step."""
         self._enter_step()
         for callback in self.callbacks:
             callback.before_step(self, self.position)  # may begin another schedule, or add an action
@@ -107,7 +107,7 @@ class TrainingLoop(Loop):
 
         Args:
             slot: number of the view in this step.
-            counts: call the callbacks after it.
+            counts: True to call the callbacks after the backward pass.
 
         Returns:
             ``StepReport.measured``.
@@ -137,7 +137,7 @@ class TrainingLoop(Loop):
         return loss.measured()
 
     def update_parameters(self) -> None:
-        """Do a step of Adam with the learning rates of this step."""
+        """Update all parameters by Adam, with the learning rates of this step."""
         factor = math.sqrt(self.settings.views_per_step)
         for name, rate in self.rates.items():
             self.state.gaussians.set_rate(name, rate * factor)
@@ -156,7 +156,7 @@ class TrainingLoop(Loop):
 
 
 def requested_layers(stage: Stage, sh_degree: int, statistic: ScreenStatistic | None) -> RenderRequest:
-    """Return the layers that a step of a stage needs."""
+    """Return the layers that a step of a stage has to render."""
     layers = stage.weights.rendered
     fades = stage.behind is not None and "normal" in layers
     return RenderRequest(

@@ -1,8 +1,8 @@
 """Loss of one step: its terms, their inputs, and their weighted sum.
 
-A new term is a field of ``Weights``, with the rendered layers and the targets that it reads, and a function in
-``TERMS``. A native pass computes the terms on normals, layers and depth in float32 on the CPU; functions in plain torch
-are its reference implementation.
+To add a term, add a field to ``Weights`` and a function to ``TERMS``. The field lists the rendered layers and the
+targets that the term reads. A native pass computes the terms on normals, layers and depth in float32 on the CPU.
+Functions in plain torch are its reference implementation.
 """
 
 from __future__ import annotations
@@ -31,17 +31,18 @@ S1_AND_S2 = ((0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
 class PolarizationTerm(NamedTuple):
-    """``factor * sum(weight * |a . S - measured|)`` over K measurements, pixels and colors.
+    """Loss term that compares predicted and measured polarization.
 
-    S is the Stokes vector of the rendered layers on a smooth dielectric (``optics.predicted_stokes``).
+    It is ``factor * sum(weight * |a . S - measured|)`` over K measurements, all pixels and all colors. S is the Stokes
+    vector of the rendered layers on a smooth dielectric (``optics.predicted_stokes``).
 
     Attributes:
-        measured: [K, H, W, 3] on the scale of Stokes vectors.
-        analyzers: K vectors a: ``S1_AND_S2``, or (1, cos 2t, sin 2t) / 2 of a polarizer at angle t.
+        measured: [K, H, W, 3] measurements on the scale of Stokes vectors.
+        analyzers: K vectors a. These are ``S1_AND_S2``, or (1, cos 2t, sin 2t) / 2 for a polarizer at angle t.
         weight: [H, W] weights of the pixels.
         factor: factor on the sum.
         refractive_index: refractive index of the surfaces, more than 1.
-        indices: [H, W] refractive indices of the pixels; None: the same everywhere.
+        indices: [H, W] refractive indices of the pixels. None means that all pixels have ``refractive_index``.
     """
 
     measured: Tensor
@@ -53,13 +54,16 @@ class PolarizationTerm(NamedTuple):
 
 
 class Directions(NamedTuple):
-    """``factor * sum(weight * (1 - n . d))``, with ``plane`` of ``|n . d|``, n the normal at unit length.
+    """Loss term that compares rendered normals with given directions.
+
+    With n the rendered normal at unit length and d the direction, it is ``factor * sum(weight * (1 - n . d))``. If
+    ``plane`` is True, it is ``factor * sum(weight * |n . d|)``.
 
     Attributes:
-        directions: [H, W, 3] unit, world axes.
+        directions: [H, W, 3] unit vectors, world axes.
         weight: [H, W] weights of the pixels.
         factor: factor on the sum.
-        plane: d is the normal of a plane that contains n.
+        plane: True if d is the normal of a plane that should contain n.
     """
 
     directions: Tensor
@@ -69,10 +73,12 @@ class Directions(NamedTuple):
 
 
 class Consistency(NamedTuple):
-    """``factor * sum(weight * (alpha - n . n_depth))`` over all pixels except the border, with the blended normal n.
+    """Loss term that makes blended normals agree with the normals of the depth map.
+
+    It is ``factor * sum(weight * (alpha - n . n_depth))`` over all pixels except the border, with the blended normal n.
 
     Attributes:
-        weight: [H, W] weights of the pixels; None: 1.
+        weight: [H, W] weights of the pixels. None means a weight of 1.
         factor: factor on the sum.
     """
 
@@ -81,12 +87,12 @@ class Consistency(NamedTuple):
 
 
 class Terms(NamedTuple):
-    """The terms of a step; at least one.
+    """Terms that the native pass computes in a step; at least one must be present.
 
     Attributes:
-        polarization: term that needs both layers.
-        directions: any number of terms.
-        consistency: term that needs the depth.
+        polarization: term on the polarization, which needs the specular and the diffuse layer.
+        directions: any number of terms on directions.
+        consistency: term on the agreement of normals and depth, which needs the depth.
     """
 
     polarization: PolarizationTerm | None
@@ -144,18 +150,19 @@ class _PixelTerms(torch.autograd.Function):
 
 
 def scaled(gradient: Tensor, factor: Tensor) -> Tensor:
-    """Multiply a gradient by the incoming scalar, which is mostly 1."""
+    """Multiply a gradient by the incoming scalar; a factor of 1 on the CPU returns the gradient itself."""
     return gradient if factor.device.type == "cpu" and float(factor) == 1 else gradient * factor
 
 
 def pixel_terms(result: RenderResult, camera: Camera, terms: Terms) -> Tensor:
-    """Return the sum of terms as a scalar, differentiable in the normal, both layers and the depth, not in alpha.
+    """Return the sum of the terms as a scalar.
 
-    Values and gradients are finite for normals of any length, including zero. The bits do not depend on the number of
-    threads.
+    It is differentiable in the normal, the specular and diffuse layers and the depth, but not in alpha. Values and
+    gradients are finite for normals of any length, including zero. The number of threads does not change a bit of the
+    result.
 
     Args:
-        result: rendered layers of the terms; float32 on the CPU.
+        result: rendered layers that the terms read; float32 on the CPU.
         camera: camera of the view.
         terms: the terms, float32 on the CPU.
 
@@ -178,7 +185,10 @@ def pixel_terms(result: RenderResult, camera: Camera, terms: Terms) -> Tensor:
 
 
 def _field(result: RenderResult) -> Tensor | None:
-    """Return the part [P, 6] of metals in the specular layer and in its polarization over ``sin^2(zenith)``."""
+    """Return the contributions of metals to the specular layer and its polarization; None without metals.
+
+    The result is [P, 6]. Columns 0 to 2 are light, and columns 3 to 5 are its polarization over ``sin^2(zenith)``.
+    """
     if (metal := result.metal) is None:
         return None
     both = torch.cat((metal.specular, metal.slope * metal.specular), dim=1)
@@ -186,13 +196,13 @@ def _field(result: RenderResult) -> Tensor | None:
 
 
 def term(*priors: str, rendered: tuple[str, ...] = (), optional: bool = False, default: float = 0.0) -> float:
-    """Define a weight with the inputs of its term.
+    """Define a field of ``Weights``, with the inputs of its loss term.
 
     Args:
-        priors: fields of ``ViewPriors``; a view without them is not compared.
-        rendered: "normal", "depth" or "layers", if the term reads these.
-        optional: the term also counts in views without ``priors``.
-        default: weight of stages that do not specify one.
+        priors: fields of ``ViewPriors`` that the term reads. Views without priors are skipped.
+        rendered: rendered data that the term reads: "normal", "depth" or "layers".
+        optional: True if the term is also computed in views without ``priors``.
+        default: weight in stages that do not specify one.
     """
     reads = {"priors": frozenset(priors), "rendered": rendered, "optional": optional}
     weight: float = field(default=default, metadata=reads)
@@ -204,16 +214,17 @@ class Weights:
     """Weights of the loss terms; a term with weight 0 is not computed.
 
     Attributes:
-        photometric: final picture against S0/2.
-        specular, diffuse: both contributions after the blend with the reflection strength, against the separated
-            pictures.
-        reflection, base: mirrored light and base color before that blend, against the same pictures.
-        normal: 1 - cosine with the disambiguated polarization normal (azimuth and zenith).
-        azimuth: distance of the normal from the plane of incidence of the AoLP (azimuth alone).
-        chromatic: 1 - cosine with the normal from color differences, where these decide one.
-        stokes: S1 and S2 predicted from layers and normal against the measured ones.
+        photometric: compares the final picture with S0/2.
+        specular, diffuse: compare the specular and diffuse layers with the separated pictures. These layers already
+            contain the factor of the reflection strength.
+        reflection, base: compare mirrored light and base color, without the factor of the reflection strength, with the
+            separated pictures.
+        normal: 1 - cosine between the rendered normal and the disambiguated polarization normal.
+        azimuth: distance of the rendered normal from the plane of incidence, which follows from the AoLP alone.
+        chromatic: 1 - cosine between the rendered normal and the normal from color differences, where one exists.
+        stokes: compares S1 and S2, predicted from layers and normal, with the measured values.
         flatness: shortest scale of the Gaussians, in percent of the scene's extent.
-        consistency: alpha - cosine of the blended normal with that of the rendered depth.
+        consistency: alpha - cosine between the blended normal and the normal of the rendered depth.
         coverage: alpha of the empty pixels, for subjects without a background.
     """
 
@@ -281,14 +292,16 @@ def depth_normals(depth: Tensor, camera: Camera) -> Tensor:
 
 
 def consistency_loss(result: RenderResult, camera: Camera, weight: Tensor | None = None) -> Tensor:
-    """Return the mean of ``alpha - n . n_depth``: 0 if blended normals agree with each other and with the depth.
+    """Return the mean of ``alpha - n . n_depth``, with the blended normal ``n``.
 
-    A picture without an inner pixel has no depth normals, and no loss.
+    It is 0 if blended normals agree with each other and with the depth. A picture without an inner pixel has no depth
+    normals, and its loss is 0.
 
     Args:
-        result: with the blended normal ``n`` (unit normals times weights that add up to alpha) and the depth.
+        result: rendering with the depth and the blended normal. The latter is the sum of unit normals times weights
+            that add up to alpha.
         camera: camera of the view.
-        weight: [H, W] weights of the pixels; None: 1.
+        weight: [H, W] weights of the pixels. None means a weight of 1.
     """
     if min(result.alpha.shape) < 3:
         return result.alpha.new_zeros(())
@@ -298,9 +311,10 @@ def consistency_loss(result: RenderResult, camera: Camera, weight: Tensor | None
 
 
 def nearest_target(normal: Tensor, priors: ViewPriors) -> Tensor:
-    """Return the targets [H, W, 3] of the normal term.
+    """Return the target normals [H, W, 3] of the normal term.
 
-    These are the candidates nearest to the rendered normals, or the choice of the frozen Gaussians.
+    These are the candidates nearest to the rendered normals. If the priors have no candidates, these are the normals
+    that the frozen Gaussians selected.
 
     Args:
         normal: [H, W, 3] blended normals, world axes, any length; gets no gradient.
@@ -313,9 +327,9 @@ def nearest_target(normal: Tensor, priors: ViewPriors) -> Tensor:
 
 
 def normal_loss(normal: Tensor, priors: ViewPriors) -> Tensor:
-    """Return the mean of 1 - cos(normal, target) over the weighted pixels (the normal term of Shan et al. 2026).
+    """Return the weighted mean of 1 - cos(normal, target), the normal term of Shan et al. 2026.
 
-    The target is ``nearest_target``.
+    The target of each pixel is ``nearest_target``.
 
     Args:
         normal: [H, W, 3] blended normals, world axes, any length.
@@ -328,15 +342,17 @@ def normal_loss(normal: Tensor, priors: ViewPriors) -> Tensor:
 def azimuth_loss(normal: Tensor, priors: ViewPriors) -> Tensor:
     """Return the mean distance |n . e| of the normal from the plane of incidence of the AoLP.
 
-    Unlike the zenith of a pure-lobe inversion, the plane does not depend on the refractive index or on the mixture of
-    lobes.
+    The plane does not depend on the refractive index or on the mixture of specular and diffuse light. A zenith computed
+    from the DoLP depends on both.
     """
     distance = dot(unit(normal, 1e-2), priors.plane).abs()
     return (distance * priors.weight).sum() / priors.total
 
 
 def chromatic_loss(normal: Tensor, priors: ViewPriors) -> Tensor:
-    """Return the mean of 1 - cos(normal, normal from color differences) over the pixels with such a normal.
+    """Return the mean of 1 - cosine between the rendered normal and the normal from color differences.
+
+    The mean is over the pixels that have a normal from color differences.
 
     Args:
         normal: [H, W, 3] blended normals, world axes, any length.
@@ -347,15 +363,15 @@ def chromatic_loss(normal: Tensor, priors: ViewPriors) -> Tensor:
 
 
 def stokes_loss(result: RenderResult, priors: ViewPriors, shading: ShadingModel) -> Tensor:
-    """Return the mean distance of the predicted S1 and S2 from the measured ones, over the square root of S0.
+    """Return the mean of |predicted - measured| over the square root of S0, for S1 and S2.
 
-    The shading model predicts them from the rendered layers and the rendered normal, so that one explanation of
-    geometry and layers has to fit the polarization of all views. ``targets.stokes_weight`` explains the root.
+    The shading model predicts S1 and S2 from the rendered layers and the rendered normal. Geometry and layers therefore
+    have to explain the polarization of all views. ``targets.stokes_weight`` explains the square root.
 
     Args:
-        result: with both layers and the normal.
+        result: rendering with the specular and diffuse layers and the normal.
         priors: priors of the view.
-        shading: shading of the recipe, for the refractive index of the run.
+        shading: shading model, with the refractive index of the run.
     """
     predicted = shading.predicted_stokes(result, priors.camera)
     distance = (predicted[1:] - priors.stokes[1:]).abs().mean(dim=(0, -1))
@@ -390,11 +406,11 @@ class _Flatness(torch.autograd.Function):
 def flatness_loss(log_scales: Tensor, radii: Tensor, extent: float) -> Tensor:
     """Return the mean shortest scale of the visible Gaussians in percent of the scene's extent.
 
-    On the CPU in float32 it is a native pass; ``flatness_loss_reference`` is the reference implementation.
+    A native pass computes it in float32 on the CPU; ``flatness_loss_reference`` is the reference implementation.
 
     Args:
         log_scales: [N, 3] logarithms of the scales.
-        radii: [N], 0 for invisible Gaussians.
+        radii: [N] radii in pixels; 0 for invisible Gaussians.
         extent: extent of the scene.
     """
     if not fits(log_scales, radii):
@@ -418,8 +434,9 @@ class StepLoss(NamedTuple):
 
     Attributes:
         total: weighted sum of the terms of a stage.
-        photometric: the photometric term alone.
-        error: mean squared difference of picture and photograph as displayed, over valid pixels; no gradient.
+        photometric: value of the photometric term alone.
+        error: mean squared difference between picture and photograph as displayed, over valid pixels, without a
+            gradient.
     """
 
     total: Tensor
@@ -435,7 +452,7 @@ class StepLoss(NamedTuple):
 def refuse_diverged(total: Tensor) -> None:
     """Check that all losses are finite.
 
-    On a GPU this waits for the device, so that the loop checks many steps at once.
+    On a GPU this check waits for the device. The loop therefore checks many steps at once.
 
     Raises:
         PolarguideError: a loss is not finite.
@@ -464,7 +481,8 @@ def layer_terms(step: Step, weights: Weights) -> Tensor | None:
         (weights.base, "base", priors.diffuse),
     ):
         if weight and layer in result.layers:
-            # The mean is over all pixels, as in the photometric term, which it must not outweigh in front of nothing.
+            # The mean is over all pixels, as in the photometric term. In views with few usable pixels, this term must
+            # not outweigh the photometric term.
             loss = photometric_loss(result.layers[layer], target, priors.separated, step.ssim_weight)
             total = total + weight * separated_share * loss
     return total
@@ -488,9 +506,9 @@ def coverage_term(step: Step, weights: Weights) -> Tensor | None:
 def normal_terms(step: Step, weights: Weights) -> Tensor:
     """Return the weighted sum of the terms that read the rendered normal.
 
-    On the CPU in float32 they are one native pass, except for the Stokes term of a shading model with its own
-    prediction. ``normal_terms_reference`` is the reference implementation. A view without priors has the consistency
-    term alone.
+    In float32 on the CPU, one native pass computes all terms. The exception is the Stokes term of a shading model that
+    predicts Stokes vectors in its own way. ``normal_terms_reference`` is the reference implementation. For a view
+    without priors, only the consistency term is computed.
     """
     result = step.result
     priors = step.targets.priors
@@ -569,13 +587,13 @@ Term = Callable[[Step, Weights], Tensor | None]
 TERMS: tuple[Term, ...] = (layer_terms, flatness_term, normal_terms, coverage_term)
 """All terms except the photometric one, in the order of their addition.
 
-Each returns its weighted loss, or None without data to compare. A term may stand for several weights that share a pass
-over the pixels.
+Each function returns its weighted loss, or None if there are no data to compare. A function may compute the terms of
+several weights in a single pass over the pixels.
 """
 
 
 def step_loss(step: Step, weights: Weights) -> StepLoss:
-    """Return the weighted sum of a stage's terms, and the difference of the picture from the photograph.
+    """Return the loss of a step: the weighted sum of its terms, and the error of the picture.
 
     Args:
         step: data of the step, with priors if a weight needs them.

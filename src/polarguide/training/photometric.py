@@ -1,12 +1,12 @@
 """Photometric loss of Gaussian splatting on displayed pictures: (1 - l) L1 + l (1 - SSIM).
 
-On the CPU in float32 a native kernel computes the loss and its gradient in one call. Elsewhere the same gradient is
-written out in plain torch, which blurs nine planes each way, where autograd would blur fifteen and store intermediate
-results. ``photometric_terms_reference`` is the reference implementation.
+In float32 on the CPU, a native kernel computes the loss and its gradient in one call. For other tensors, the gradient
+is written out in plain torch. This blurs nine planes in each direction, while autograd would blur fifteen planes and
+store intermediate results. ``photometric_terms_reference`` is the reference implementation.
 
-``partial_terms`` is the loss of views whose pictures do not determine the Stokes vector: one polarizer angle, two, or
-none. The rendered layers predict S0, S1 and S2, and with them the intensity behind any analyzer,
-``(S0 + S1 c + S2 s) / 2``. The prediction is compared with the measured intensities.
+``partial_terms`` is the loss of views whose pictures do not determine the Stokes vector, because they have fewer than
+three polarizer angles. The rendered layers predict S0, S1 and S2, and thus the intensity behind any analyzer, ``(S0 +
+S1 c + S2 s) / 2``. The prediction is compared with the measured intensities.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ class Photometric(NamedTuple):
     """Difference of a picture from a photograph.
 
     Attributes:
-        loss: see ``photometric_loss``.
-        error: mean squared difference as displayed, over the same pixels and colors; without a gradient.
+        loss: result of ``photometric_loss``.
+        error: mean squared difference of the displayed pictures, over the same pixels and colors, without a gradient.
     """
 
     loss: Tensor
@@ -44,7 +44,7 @@ class Photometric(NamedTuple):
 
 
 class _Clip(torch.autograd.Function):
-    """Clipping to [0, 1]; outside, a gradient passes only if it brings the value back."""
+    """Clipping to [0, 1]. Outside this range, a gradient passes only if a step against it brings the value back."""
 
     @staticmethod
     def forward(ctx: Any, values: Tensor) -> Tensor:
@@ -69,10 +69,12 @@ def gaussian_window(dtype: torch.dtype, device: torch.device) -> Tensor:
 def structural_similarity(x: Tensor, y: Tensor, xx: Tensor, yy: Tensor, xy: Tensor) -> Tensor:
     """Return the SSIM [...] of two pictures in [0, 1] (Wang et al. 2004, Eq. 13).
 
-    K1 = 0.01, K2 = 0.03, population covariance.
+    The constants are K1 = 0.01 and K2 = 0.03. Variances and the covariance are population values.
 
     Args:
-        x, y, xx, yy, xy: [...] means under the window of both pictures, their squares and their product.
+        x, y: [...] means of both pictures under the window.
+        xx, yy: [...] means of their squares.
+        xy: [...] mean of their product.
     """
     numerator = (2 * x * y + _C1) * (2 * (xy - x * y) + _C2)
     return numerator / ((x * x + y * y + _C1) * ((xx - x * x) + (yy - y * y) + _C2))
@@ -136,7 +138,7 @@ class _Photometric(torch.autograd.Function):
 
 
 class ExplicitPhotometric(_Photometric):
-    """The loss with its gradient, computed in the forward pass; for any device."""
+    """Photometric loss whose forward pass also computes the gradient, for any device."""
 
     @staticmethod
     def forward(
@@ -194,22 +196,24 @@ def photometric_loss(
 ) -> Tensor:
     """Return the mean over valid pixels and colors of ``(1 - l) |x - y| + l (1 - SSIM(x, y))``.
 
-    Here ``x`` is sRGB of the clipped prediction and ``y`` the target (Kerbl et al. 2023, Eq. 7, on displayed pictures).
-    SSIM has an 11 x 11 Gaussian window of sigma 1.5, K1 = 0.01, K2 = 0.03, and zeros beyond the border. Within five
-    pixels of the border, values differ from those of metrics that mirror the picture. Pixels without weight still lie
-    in the windows of their neighbors.
+    ``x`` is the clipped prediction, encoded in sRGB, and ``y`` is the target (Kerbl et al. 2023, Eq. 7, on displayed
+    pictures). SSIM has an 11 x 11 Gaussian window of sigma 1.5, K1 = 0.01 and K2 = 0.03. The picture is padded with
+    zeros. Within five pixels of the border, SSIM differs from metrics that mirror the picture at the border. Pixels
+    with weight 0 still influence the SSIM of their neighbors.
 
-    A value outside [0, 1] gets the gradient at the boundary if a step against it leads back into the interval, else
-    zero, so that saturated pixels are not stuck. One NaN makes the loss NaN.
+    A predicted value outside [0, 1] gets the gradient at the boundary if a step against this gradient leads back into
+    the interval. Otherwise its gradient is zero. Saturated pixels can therefore recover. A single NaN makes the loss
+    NaN.
 
     Args:
         prediction: [H, W, 3] linear radiance, any size.
         target_shown: [H, W, 3] picture as displayed, in [0, 1]; gets no gradient.
-        weight: [H, W] nonnegative weights, 1 for pixels that count; None: all pixels. Gets no gradient.
+        weight: [H, W] nonnegative weights, 1 for valid pixels and 0 for others; gets no gradient. None means that all
+            pixels are valid.
         ssim_weight: l in [0, 1].
 
     Returns:
-        The scalar loss, differentiable in the prediction; 0 if no pixel counts.
+        The scalar loss, differentiable in the prediction; 0 if no pixel is valid.
 
     Raises:
         ValueError: a shape differs.
@@ -220,7 +224,10 @@ def photometric_loss(
 def photometric_terms(
     prediction: Tensor, target_shown: Tensor, weight: Tensor | None = None, ssim_weight: float = 0.2
 ) -> Photometric:
-    """Compute ``photometric_loss`` and, at almost no cost, the mean squared difference as displayed."""
+    """Compute ``photometric_loss`` and the mean squared difference of the displayed pictures.
+
+    The second value costs almost no additional time.
+    """
     _check(prediction, target_shown, weight)
     target_shown = target_shown.detach().to(prediction)
     weight = None if weight is None else weight.detach().to(prediction)
@@ -236,7 +243,7 @@ def behind_analyzer(stokes: Tensor, analyzer: Tensor) -> Tensor:
 
     Args:
         stokes: [3, H, W, 3] Stokes vectors.
-        analyzer: [2], or [2, H, W].
+        analyzer: c and s, [2], or [2, H, W] if they depend on the pixel.
     """
     cosine, sine = analyzer.to(stokes)[..., None].unbind(0)
     return (stokes[1] * cosine + stokes[2] * sine) / 2
@@ -245,21 +252,28 @@ def behind_analyzer(stokes: Tensor, analyzer: Tensor) -> Tensor:
 def partial_terms(
     step: Step, view: PartialView, photometric: float, polarization: float
 ) -> tuple[Tensor, Photometric]:
-    """Return the weighted photometric and polarization terms of a partial view, and the photometric one.
+    """Return the loss of a view whose pictures do not determine the Stokes vector.
 
-    The photometric term compares the measured picture with its prediction: S0/2 if that is measured, else the mean M of
-    the intensities behind the analyzers. The polarization term takes the place and the weight of the Stokes term. It is
-    the mean of ``2 |(I - M) - (S1 c + S2 s) / 2| / sqrt(2 M + 0.01)``, with c and s of the analyzer minus those of M.
-    Both sides are differences, so that S0 cancels. A view with one picture has no such term, because its information is
-    in the photometric term. With the rendered S0/2 in place of M, a rendering that is too bright would be explained by
-    more light that its analyzer blocks, which makes it brighter.
+    The photometric term compares a measured picture with its prediction. The picture is S0/2 if that was measured, and
+    otherwise the mean M of the intensities behind the analyzers. The polarization term replaces the Stokes term and has
+    its weight. It is the mean of ``2 |(I - M) - (S1 c + S2 s) / 2| / sqrt(2 M + 0.01)`` over the pictures I. Here c and
+    s are the components of the analyzer of I minus the components of the mean analyzer of M. Both I - M and its
+    prediction are differences, so S0 cancels.
 
-    Without a weight of the polarization, or without layers for a prediction, the picture counts as a photograph.
+    A view with one picture has no polarization term, because all its information is in the photometric term. The
+    polarization term uses the measured M and not the rendered S0/2. Otherwise a rendering that is too bright could be
+    explained by more light that the analyzer blocks, which would make it even brighter.
+
+    If the weight of the polarization is 0, or if layers for a prediction are missing, the picture is treated as a
+    photograph without a filter.
 
     Args:
         step: data of the step.
         view: measurements of its view.
-        photometric, polarization: weights of the stage.
+        photometric, polarization: weights of both terms in the stage.
+
+    Returns:
+        A tuple of the weighted sum of both terms, and the photometric term.
     """
     result = step.result
     shading = step.shading

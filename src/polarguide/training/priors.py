@@ -1,13 +1,15 @@
 """Polarization priors of a view, from its Stokes vectors and the normals of frozen Gaussians.
 
-This is the coupling of PolarGuide-GSDR (Shan et al. 2026). The normals of the Gaussians resolve the ambiguity of the
-polarization normals and of the separation. The resulting priors supervise the Gaussians until the next refresh.
+PolarGuide-GSDR (Shan et al. 2026) couples Gaussians and polarization in this way. The normals of the Gaussians resolve
+the ambiguities of polarization normals and of the separation into layers. The resulting priors supervise the Gaussians
+until the next refresh.
 
-Flat mirroring surfaces have one normal that explains the polarization of a large part of a view. Light that a
+A flat mirroring surface has a single normal, which explains the polarization of a large part of a view. Light that a
 dielectric or a metal mirrors is polarized across the plane of incidence. The AoLP of a pixel therefore gives a
-direction perpendicular to its normal, for any mirrored light at any apparent depth. All pixels of a plane have one
-normal, and the directions of many pixels determine it up to its sign, which follows from the camera. Both
-ambiguities, of pi and of pi/2, vanish. Still water, which shows the depth of the mirrored scene, has no other cue.
+direction perpendicular to its normal, for any mirrored light at any apparent depth. The directions of many pixels
+determine the normal of the plane up to its sign. The sign follows from the camera, because the surface faces it. Both
+ambiguities, of pi and of pi/2, vanish. Still water appears at the depth of the mirrored scene, and polarization is the
+only cue to its surface.
 
 The planes of incidence of a sphere also meet in one line, the ray through its center. There Fresnel's equations allow
 almost no polarization, so that the measurement contradicts this normal.
@@ -37,8 +39,8 @@ class Flat:
     """A flat surface in a view.
 
     Attributes:
-        normal: [3] unit, world axes, towards the camera.
-        where: [H, W] bool, the pixels that it explains.
+        normal: [3] unit normal, world axes, towards the camera.
+        where: [H, W] bool, True for pixels that the normal explains.
     """
 
     normal: Tensor
@@ -51,10 +53,11 @@ class Flat:
 
 @torch.no_grad()
 def flat_surface(view: View, refractive_index: float, rules: FlatRules) -> Flat | None:
-    """Find the flat surface that explains most of a view; None: no surface explains enough.
+    """Find the flat surface that explains the most pixels of a view.
 
-    The pictures of the view have to determine the Stokes vector. Random pairs of pixels propose normals. The proposal
-    with the most agreeing pixels is refined on these by least squares.
+    Return None if no surface explains enough pixels. The pictures of the view have to determine the Stokes vector.
+    Random pairs of pixels propose normals. The proposal with the most agreeing pixels is refined by least squares on
+    these pixels.
     """
     luminance = optics.luminance(view.stokes())
     rays = view.camera.rays()
@@ -100,8 +103,8 @@ def _agrees(off: Tensor, cosine: Tensor, dolp: Tensor, refractive_index: float, 
     """Return a mask of pixels that agree with normals.
 
     Args:
-        off: cosine between the normal and the direction of the pixel.
-        cosine: cosine between the normal and the reversed ray.
+        off: cosine between the normal and the direction across the plane of incidence of the pixel.
+        cosine: cosine between the normal and the direction to the camera.
         dolp: DoLP of the pixel.
         refractive_index: refractive index of the surface.
         rules: tolerances.
@@ -113,9 +116,10 @@ def _agrees(off: Tensor, cosine: Tensor, dolp: Tensor, refractive_index: float, 
 
 
 def flat_surfaces(views: Iterable[View], refractive_index: float, rules: FlatRules) -> dict[str, Flat]:
-    """Find flat surfaces with similar normals in enough views; return them by view, with the mean normal.
+    """Find flat surfaces that appear with similar normals in enough views, and return them by view.
 
-    Views that do not determine the Stokes vector are left out.
+    Each returned surface has the mean normal of the similar surfaces. Views that do not determine the Stokes vector are
+    skipped.
     """
     surfaces = dict[str, Flat]()
     determined = 0
@@ -138,14 +142,17 @@ def flat_surfaces(views: Iterable[View], refractive_index: float, rules: FlatRul
 
 
 class Unguided(NamedTuple):
-    """Part of a view's priors that does not depend on the guide and is the same at all refreshes.
+    """Part of a view's priors that depends on the pictures alone.
+
+    It does not depend on the Gaussians, so it is computed once and reused at all refreshes. The last four attributes
+    are None unless the settings request normals from color differences.
 
     Attributes:
-        usable: [H, W] bool, pixels whose polarization exceeds the threshold and its noise.
-        degree: [H, W] DoLP, without the bias of noise if the settings test it against the noise.
-        zenith, azimuth: [H, W] radians, of the normals of the color differences; None if they are not requested.
-        certainty: [H, W] weight of these normals, in [0, 1], 0 where color decides nothing; None like the angles.
-        colorful: [H, W] from 0 for a gray body to 1 for a colored one; None like the angles.
+        usable: [H, W] bool, True for pixels whose polarization exceeds the threshold and its noise.
+        degree: [H, W] DoLP. It has no bias by noise if the settings test it against the noise.
+        zenith, azimuth: [H, W] angles in radians of the normals from color differences.
+        certainty: [H, W] weight of these normals, in [0, 1]; 0 where color differences determine no normal.
+        colorful: [H, W] 0 for a gray body, 1 for a colored body, and values between them.
     """
 
     usable: Tensor
@@ -188,7 +195,7 @@ def debiased_dolp(luminance: Tensor, noise: Tensor | float) -> Tensor:
 
     Args:
         luminance: [3, H, W] Stokes vectors.
-        noise: [H, W] standard deviation of one of the four intensities; 0: no noise.
+        noise: [H, W] standard deviation of one of the four intensities. 0 means no noise.
     """
     if not isinstance(noise, Tensor):
         return optics.dolp(luminance)
@@ -196,7 +203,9 @@ def debiased_dolp(luminance: Tensor, noise: Tensor | float) -> Tensor:
 
 
 def guide_normals(normal: Tensor, rays: Tensor, least: float) -> tuple[Tensor, Tensor]:
-    """Return unit normals [H, W, 3] that face the camera, and a mask [H, W] of the reliable ones.
+    """Convert blended normals to unit normals that face the camera.
+
+    Returns a tuple of the unit normals [H, W, 3] and a mask [H, W] of the pixels with a reliable normal.
 
     Args:
         normal: [H, W, 3] blended normals. A normal that faces away from the camera is turned until it is perpendicular
@@ -225,12 +234,15 @@ def view_priors(
     Args:
         view: the capture; its pictures have to determine the Stokes vector.
         normal: [H, W, 3] normals rendered from the frozen Gaussians, world axes, any length. The computation runs on
-            its device.
+            the device of this tensor.
         settings: candidates, separation and other settings of the priors.
         refractive_index: refractive index of all surfaces, or [H, W] of each pixel.
-        precomputed: ``unguided`` of the view; None: computed here, with one refractive index for all surfaces.
-        metal: [H, W] share of metals, on which the rules for dielectrics do not hold; None: no metal.
-        flat: a flat surface, whose normal replaces the guide and the color differences far from the guide.
+        precomputed: result of ``unguided`` for the view. With None it is computed here, and the refractive index must
+            be a number.
+        metal: [H, W] share of metals, to which the rules for dielectrics do not apply. None means that there are no
+            metals.
+        flat: a flat surface. Where its normal is far from the rendered normals, it replaces them and the normals from
+            color differences.
     """
     view, rays = view.to(normal.device), view.camera.rays(device=normal.device)
     if precomputed is None:
@@ -285,7 +297,7 @@ def _plane(chosen: Tensor, by_color: tuple[Tensor, Tensor] | None, faint: Tensor
     Args:
         chosen: [H, W, 3] chosen candidates.
         by_color: see ``_by_color``.
-        faint: [H, W] bool, nearly unpolarized pixels.
+        faint: [H, W] bool, True for nearly unpolarized pixels.
         rays: [H, W, 3] unit directions from the camera.
     """
     plane = unit(torch.linalg.cross(rays, chosen))
@@ -299,10 +311,16 @@ def _plane(chosen: Tensor, by_color: tuple[Tensor, Tensor] | None, faint: Tensor
 def _without_metal(
     metal: Tensor, luminance: Tensor, normal: Tensor, rays: Tensor, shares: tuple[float, float]
 ) -> tuple[Tensor, Tensor]:
-    """Return two weights [H, W] next to metals: of rules for dielectrics alone, and of predictions for both materials.
+    """Return two weights of the pixels of a view that contains metals.
+
+    Returns a tuple of two tensors [H, W]. The first is a weight for terms that hold for dielectrics only. The second is
+    a weight for terms that predict both materials.
 
     Args:
-        shares: metal shares between which a pixel changes from dielectric to metal.
+        metal: [H, W] share of metals.
+        luminance: [3, H, W] Stokes vectors.
+        normal, rays: [H, W, 3] camera axes.
+        shares: two metal shares. At the first, a pixel counts as a dielectric, and at the second as a metal.
     """
     none, whole = shares
     body = 1 - ((metal - none) / (whole - none)).clamp(0, 1)
@@ -316,9 +334,9 @@ class _Guide(NamedTuple):
 
     Attributes:
         normal: [H, W, 3] normals.
-        shown: [H, W] bool, pixels with a known normal.
+        shown: [H, W] bool, True for pixels with a known normal.
         on_plane: [H, W, 3] normals of the flat surface.
-        astray: [H, W] bool, pixels where these replace the normals of the Gaussians.
+        astray: [H, W] bool, True for pixels where ``on_plane`` replaces the normals of the Gaussians.
     """
 
     normal: Tensor
@@ -339,7 +357,10 @@ def _guide(view: View, normal: Tensor, flat: Flat | None, rays: Tensor, settings
 def _by_color(
     precomputed: Unguided, guide: _Guide, settings: Priors, rays: Tensor
 ) -> tuple[Tensor, Tensor] | None:
-    """Return the normals [H, W, 3] of color differences or of a flat surface, and their weight; None without them."""
+    """Return normals [H, W, 3] from color differences or of a flat surface, and their weights [H, W].
+
+    Return None if the settings request no normals from color differences.
+    """
     _, _, zenith, azimuth, certainty, colorful = precomputed
     if zenith is None or azimuth is None or certainty is None or colorful is None:
         return None
@@ -355,7 +376,10 @@ def _by_color(
 def _separated(
     stokes: Tensor, guide: _Guide, settings: Priors, refractive_index: float | Tensor, rays: Tensor
 ) -> optics.Separation:
-    """Return the separated layers of the recipe, ``conditioned`` where the guide is known."""
+    """Separate specular and diffuse light by the method that the recipe specifies.
+
+    In the exact method, ``conditioned`` is False at pixels without a known normal.
+    """
     if settings.separation == "paper":
         zenith = optics.diffuse_zenith(optics.dolp(optics.luminance(stokes)), refractive_index)
         return optics.paper_separation(stokes, zenith, refractive_index)
@@ -364,7 +388,9 @@ def _separated(
 
 
 def _across(luminance: Tensor, normal: Tensor, rays: Tensor) -> Tensor:
-    """Return the polarization [H, W] across the plane of incidence times ``sin^2(zenith)``; negative in the plane.
+    """Return the polarization [H, W] across the plane of incidence times ``sin^2(zenith)``.
+
+    The value is negative for light that is polarized in the plane of incidence.
 
     Args:
         luminance: [3, H, W] Stokes vectors.
@@ -377,15 +403,18 @@ def _across(luminance: Tensor, normal: Tensor, rays: Tensor) -> Tensor:
 
 
 def _within(normal: Tensor, guide: Tensor, full: float, none: float) -> Tensor:
-    """Return a weight [H, W] that falls with the angle of unit normals, from 1 at ``full`` to 0 at ``none`` degrees."""
+    """Return a weight [H, W] that falls with the angle between two unit normals.
+
+    It is 1 up to ``full`` degrees, falls linearly, and is 0 from ``none`` degrees on.
+    """
     angle = torch.linalg.cross(normal, guide).norm(dim=-1).atan2(dot(normal, guide)).rad2deg()
     return ((none - angle) / (none - full)).clamp(0, 1)
 
 
 def _noise(view: View) -> Tensor | float:
-    """Return the standard deviation [H, W] of the noise of one of the four intensities; 0 for fewer pictures.
+    """Return the standard deviation [H, W] of the noise of one of the four intensities.
 
-    Three pictures have no redundancy to estimate noise from.
+    Return 0 for views with fewer than four angles, because only redundant pictures allow an estimate of the noise.
     """
     return optics.intensity_noise(view.intensities().mean(dim=-1)) if view.exposures == FOUR else 0.0
 
@@ -393,7 +422,7 @@ def _noise(view: View) -> Tensor | float:
 def _candidates(
     kind: Candidates, luminance: Tensor, rays: Tensor, refractive_index: float | Tensor
 ) -> optics.Candidates | optics.PhysicalCandidates | Tensor:
-    """Return the candidate normals [H, W, K, 3] of a recipe, or the record that holds them, in camera axes."""
+    """Return the candidate normals [H, W, K, 3] of a recipe in camera axes, or a record with these normals."""
     if kind == "physical":
         return optics.physical_candidates(luminance, rays, refractive_index)
     paper = optics.paper_candidates(luminance, rays, refractive_index)
@@ -411,11 +440,14 @@ def _normals(candidates: optics.Candidates | optics.PhysicalCandidates | Tensor)
 
 
 def facing(zenith: Tensor, azimuth: Tensor, guide: Tensor, rays: Tensor) -> Tensor:
-    """Return normals [H, W, 3] of an azimuth that is known up to half a turn, on the guide's side of each ray.
+    """Return the normals [H, W, 3] of an azimuth that is known up to half a turn.
+
+    An azimuth and its opposite give two normals. The normal nearer to the guide is returned.
 
     Args:
         zenith, azimuth: [H, W] radians.
-        guide, rays: [H, W, 3] camera axes.
+        guide: [H, W, 3] guide normals, camera axes.
+        rays: [H, W, 3] unit directions from the camera.
     """
     normal = optics.normal_from_angles(zenith, azimuth, rays)
     mirrored = optics.normal_from_angles(zenith, azimuth + torch.pi, rays)
@@ -430,17 +462,21 @@ def facing_chromatic(
     good: Tensor,
     settings: Priors,
 ) -> tuple[Tensor, Tensor]:
-    """Return normals of the color differences on the guide's side of each ray, and their weights.
+    """Estimate normals from the polarization of color differences, and their weights.
+
+    Color differences leave two opposite azimuths. The one nearer to the guide is used.
 
     Args:
         stokes: [3, H, W, 3] Stokes vectors.
-        guide: [H, W, 3] camera axes.
+        guide: [H, W, 3] guide normals, camera axes.
         rays: [H, W, 3] unit directions from the camera.
         refractive_index: refractive index of all surfaces.
-        good: [H, W] bool, pixels whose measurement counts.
+        good: [H, W] bool, True for pixels with a valid measurement.
+        settings: settings of the priors.
 
     Returns:
-        [H, W, 3] unit, camera axes; [H, W] in [0, 1], 0 where color decides nothing.
+        A tuple of the unit normals [H, W, 3] in camera axes and their weights [H, W] in [0, 1]. The weight is 0 where
+        color differences determine no normal.
     """
     zenith, azimuth, weight, _ = _chromatic_angles(stokes, refractive_index, good, settings)
     return facing(zenith, azimuth, guide, rays), weight
@@ -449,9 +485,9 @@ def facing_chromatic(
 def _chromatic_angles(
     stokes: Tensor, refractive_index: float, good: Tensor, settings: Priors
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Return zenith, azimuth and weight of the normals of the color differences, and the colorfulness of the body.
+    """Return zenith, azimuth and weight of the normals from color differences, and the colorfulness of the body.
 
-    All are [H, W], the last two in [0, 1].
+    All four tensors are [H, W]. The angles are in radians. The weight and the colorfulness are in [0, 1].
     """
     chromatic = optics.chromatic_normals(stokes, refractive_index)
     gray, color = settings.gray

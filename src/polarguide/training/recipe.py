@@ -26,12 +26,13 @@ class MetalRules:
     """Constants of the energy whose minimum decides on metals (``training.metals.search``).
 
     Attributes:
-        prior: log likelihood ratio per view, in nats, by which a metal must be likelier than a dielectric.
-        trust: upper bound of the evidence of a single Gaussian, in nats: one of 20 may be wrong at any evidence.
-        likeness: cost, in nats, of two similar neighbors of which one is a metal and the other a dielectric.
-        tint: standard deviation of the logarithm of a surface's tint relative to the mean light of the scene. Metals
-            are hardly more deeply colored than gold.
-        surface: least gain of a connected metal surface, in nats.
+        prior: log likelihood ratio, in nats per view, by which a metal must be more likely than a dielectric.
+        trust: upper bound of the evidence of a single Gaussian, in nats. With 3, one Gaussian of 20 may be wrong even
+            if its evidence is strong.
+        likeness: cost, in nats, of two similar neighboring Gaussians if only one of them is a metal.
+        tint: standard deviation of the logarithm of a surface's tint relative to the mean light of the scene. Hardly
+            any metal is more deeply colored than gold.
+        surface: fixed cost, in nats, of each connected piece of metal. A piece that gains less is discarded.
     """
 
     prior: float = 0.45
@@ -43,21 +44,24 @@ class MetalRules:
 
 @dataclass(frozen=True)
 class MetalViews:
-    """Constants of the measurements for the search for metals, and of the light gain from the first metals.
+    """Constants of the measurements on which the search for metals is based.
+
+    The first metals also determine how much brighter the learned light should be. This factor is called the gain.
 
     Attributes:
         most_views: largest number of examined views, evenly spread.
-        least_share: a view counts if a Gaussian has at least this share of its largest blending weight in it.
-        least_normal: length of a blended normal above which a pixel counts; shorter ones mix surfaces.
-        cosines: cosines of the zenith angle between which a view counts. Light is unpolarized at normal incidence, and
-            normals and reflectances are uncertain at grazing angles.
-        dark: radiance (full scale is 1) that is added to the reference of relative errors.
-        reach: share of the cameras' distance from the middle of the points within which metals are searched. Gaussians
-            farther away are behind the subject in views from the other side.
-        contradicted: share of the labels of a view above which contradictions by other views lead to a warning.
-        gain_views: number of views for the gain of the light.
-        gain_share: metal share above which a pixel counts for the gain.
-        gain_pixels: least share of counted pixels.
+        least_share: share of a Gaussian's largest blending weight. A view with a smaller weight of the Gaussian is
+            ignored.
+        least_normal: length of a blended normal above which a pixel is used. Shorter normals are mixtures of surfaces.
+        cosines: smallest and largest cosine of the zenith angle at which a view is used. Light is unpolarized at normal
+            incidence. Normals and reflectances are uncertain at grazing angles.
+        dark: radiance that is added to the denominator of relative errors; full scale is 1.
+        reach: radius around the middle of the points in which metals are searched, as a share of the cameras' distance.
+            Gaussians farther away are behind the subject in views from the other side.
+        contradicted: share of the labels of a view that other views may contradict without a warning.
+        gain_views: number of views from which the gain is measured.
+        gain_share: metal share above which a pixel is used for the gain.
+        gain_pixels: least share of pixels that must be usable for the gain.
         most_gain: largest gain.
     """
 
@@ -76,36 +80,41 @@ class MetalViews:
 
 @dataclass(frozen=True)
 class AngleRules:
-    """Constants of the search for unknown polarizer angles, and of the check of known ones.
+    """Constants for estimating unknown polarizer angles and for checking known angles.
 
     Attributes:
-        search_steps: steps of the schedule of a search before the training. More steps are not better: mirroring flat
-            surfaces, such as water, bend to explain their reflections without polarization.
-        search_size: largest number of pixels of the longer side of its pictures.
-        first, every, last: shares of these steps at which angles are fitted; their mean counts. Earlier fits would
-            confirm the initial guess, and later ones the errors that the model has absorbed by then.
-        again: shares of the fits of a second search, which begins with the angles of the first. Most of these are right
-            and improve the prediction for the others. A third search found no more on two scenes.
-        checks: shares of all steps at which known angles are compared with the pictures. Early, the model predicts
-            little; late, colors and surfaces have adapted to wrong angles. At half size and 1,500 steps, six of 63
-            angles were wrong by 45 or 90 degrees: one, three and five of them contradict, five in all, and no right
-            one.
-        least_spread: spread in degrees below which a fit gains no more weight.
-        weak: modulation below which an angle is unreliable. Wrong predictions reduce the modulation: pictures through a
-            filter seldom have all of it, and half is usual at the first fits.
+        search_steps: number of steps of a short training that searches for angles before the main training. More steps
+            are not better: flat mirroring surfaces, such as water, bend to explain their reflections without
+            polarization.
+        search_size: largest number of pixels along the longer side of the pictures in a search.
+        first, every, last: schedule of the fits in a search, as shares of its steps. Angles are fitted from ``first``
+            to ``last`` at intervals of ``every``, and the mean of the fits is used. Earlier fits would confirm the
+            initial guess. Later fits would confirm errors that the model has learned by then.
+        again: shares of the steps of a second search at which angles are fitted. It begins with the angles that the
+            first search found. Most of them are right and improve the prediction for the remaining pictures. A third
+            search brought no improvement on two scenes.
+        checks: shares of all steps at which known angles are compared with the pictures. Early in a training, the model
+            predicts little. Later, colors and surfaces have adapted to wrong angles. In a test at half size with 1,500
+            steps, six of 63 angles were wrong by 45 or 90 degrees. The three checks found one, three and five of these
+            errors, five in total, and rejected no correct angle.
+        least_spread: spread in degrees below which the weight of a fit does not increase any more.
+        weak: modulation below which an angle is unreliable. Wrong predictions reduce the modulation. Pictures through a
+            filter seldom reach 1, and 0.5 is usual at the first fits.
         vague: spread in degrees above which a picture does not determine its angle.
-        lost: spread in degrees above which an angle is no best guess. Guesses with up to 30 degrees of error are better
-            than a photograph without a filter; spreads of 20 to 60 degrees mostly had errors under 20.
-        disagree: scatter in degrees above which the fits of a picture disagree.
-        contradicts: degrees between specified and fitted angle above which they contradict each other, if that also
-            exceeds three times the spread and three standard deviations of the deviations of all pictures. Angles are
-            read from rings to a few degrees.
-        locked: standard deviation of the logarithms of fitted gains up to which exposures count as equal: 0.03 to 0.07
-            for equal exposures at the first fit, and 0.13 for automatic exposure within 0.3 stops.
-        fewest: number of pictures that determine a spread of gains.
-        poor: ``Judgment.unexplained`` above which a picture may be at another angle. On four test scenes and two seeds,
-            every picture with an error over 45 degrees exceeded it, and at most five others of 63. It was chosen with
-            one of these seeds.
+        lost: spread in degrees above which a fitted angle is not used, not even as a best guess. A guess with an error
+            of up to 30 degrees is better than the assumption that there was no filter. Fits with spreads of 20 to 60
+            degrees mostly had errors under 20 degrees.
+        disagree: scatter of the fitted angles of a picture, in degrees, above which the fits disagree.
+        contradicts: difference in degrees above which a fitted angle contradicts the specified angle. The difference
+            must also exceed three times the spread, and three standard deviations of the differences of all pictures.
+            Users read angles from filter rings with errors of a few degrees.
+        locked: standard deviation of the logarithms of fitted gains up to which exposures are treated as equal. At the
+            first fit, it was 0.03 to 0.07 for equal exposures, and 0.13 for automatic exposures that differed by up to
+            0.3 stops.
+        fewest: least number of pictures from which the spread of gains is computed.
+        poor: value of ``Judgment.unexplained`` above which a picture may have been taken at another angle. On four test
+            scenes with two seeds, every picture with an error over 45 degrees exceeded this limit. At most five of the
+            63 pictures exceeded it without such an error. The limit was chosen with one of these seeds.
     """
 
     search_steps: int = 900
@@ -131,19 +140,21 @@ class FlatRules:
     """Constants of the search for flat surfaces.
 
     Attributes:
-        tries: number of pixel pairs that propose a normal.
-        samples: approximate number of pixels that judge them.
-        close: sine of the angle between the plane of incidence of a pixel and the normal up to which they agree.
-        apart: sine of the angle between the directions of two pixels below which they propose no normal.
-        least: least share of a view that a flat surface covers. One normal explains up to a sixth of a curved surface
-            by chance.
-        faint: DoLP above which a pixel counts.
-        slack: factor on Fresnel's DoLP, and addition to it, beyond which a pixel contradicts.
-        grazing: cosine between normal and ray below which a surface is not visible.
-        window: side in pixels of the square around a pixel for ``most``.
-        most: least share of that square that agrees.
-        alike: degrees up to which flat surfaces of different views are the same.
-        fewest, share: least number and least share of the views that show the surface.
+        tries: number of random pixel pairs. Each pair proposes a normal.
+        samples: approximate number of pixels on which the proposed normals are tested.
+        close: largest sine of the angle between a normal and the plane of incidence of a pixel that agrees with it.
+        apart: least sine of the angle between the directions of two pixels. Closer directions propose no normal.
+        least: least share of a view that a flat surface must cover. By chance, one normal explains up to a sixth of a
+            curved surface.
+        faint: DoLP above which a pixel is used.
+        slack: factor on Fresnel's DoLP, and offset that is added to the product. A pixel with a larger DoLP contradicts
+            the normal.
+        grazing: least cosine of the angle between a normal and the direction to the camera. Below it, the surface is
+            not visible.
+        window: side in pixels of the square around a pixel to which ``most`` refers.
+        most: least share of the pixels in that square that must agree with the normal.
+        alike: largest angle in degrees between the normals of two views that show the same flat surface.
+        fewest, share: least number and least share of the views that must show the surface.
     """
 
     tries: int = 400
@@ -170,12 +181,12 @@ _REMEDY = "Correct the recipe."
 
 @dataclass(frozen=True)
 class Repeat:
-    """An action that repeats at a fixed distance.
+    """An action that repeats at regular intervals.
 
     Attributes:
         action: name of the action.
-        fraction: distance between two occurrences, as a fraction of all steps.
-        minimum: least distance in steps.
+        fraction: interval between two occurrences, as a fraction of all steps.
+        minimum: shortest interval in steps.
     """
 
     action: Action
@@ -185,15 +196,16 @@ class Repeat:
 
 @dataclass(frozen=True)
 class Rounds:
-    """Actions in turn, evenly spread over a stage in as many whole rounds as fit, at least one.
+    """Actions that take turns at regular intervals during a stage.
 
-    Two actions never coincide, for any number of steps. The last turn of the last round falls on the end of the stage
-    and is left out; it belongs to ``on_enter`` of the next stage.
+    A round runs every action once. A stage has as many complete rounds as fit into it, but at least one. Two actions
+    never run before the same step. The last turn of the last round falls on the end of the stage and is left out,
+    because ``on_enter`` of the next stage runs this action.
 
     Attributes:
         actions: the actions in their order.
-        fraction: least distance between two turns, as a fraction of all steps.
-        minimum: least distance in steps. A stage that is too short for one such round still has one.
+        fraction: shortest interval between two turns, as a fraction of all steps.
+        minimum: shortest interval in steps. A stage that is too short for one round has shorter intervals.
     """
 
     actions: tuple[Action, ...]
@@ -201,7 +213,12 @@ class Rounds:
     minimum: int = 1
 
     def turns(self, length: int, steps: int) -> dict[int, Action]:
-        """Return the due actions by step, counted from the beginning of a stage of ``length`` of ``steps`` steps."""
+        """Return the due actions by step, counted from the beginning of the stage.
+
+        Args:
+            length: number of steps of the stage.
+            steps: number of steps of the training.
+        """
         distance = max(1, self.minimum, round(self.fraction * steps))
         count = len(self.actions) * max(1, length // (distance * len(self.actions)))
         places = (round(turn * length / count) for turn in range(1, count))
@@ -215,20 +232,20 @@ class Stage:
     Attributes:
         name: displayed name.
         fraction: share of all steps.
-        reflection: shade the picture with deferred reflection.
+        reflection: True to shade the picture with deferred reflection.
         weights: weights of the losses.
-        densify: run the density control.
+        densify: True to run the density control, which adds and removes Gaussians.
         repeats: actions that repeat within the stage.
-        rounds: actions in turn within the stage.
-        on_enter: actions at the first step.
-        rate_factors: factors on the learning rates of the recipe by name; 1 for other names.
-        hold_normals: the terms on the layers reach the normals through Fresnel's equations only, and not through the
-            mirrored light. The separated pictures depend on earlier normals, so that normals that follow them would
-            confirm their own errors.
-        behind: begin and end of a fading of terms on normals and depth, as shares of the distance of the cameras from
-            the middle of the points, which nine tenths of the cameras do not exceed. Beyond the end these terms only
-            rotate Gaussians (``training.behind``). Without fading, surfaces grow behind the subject that agree with
-            their normals and not with the pictures. None: no fading.
+        rounds: actions that take turns within the stage.
+        on_enter: actions before the first step of the stage.
+        rate_factors: factors on the learning rates of the recipe by name. Rates without a factor do not change.
+        hold_normals: True if the terms on the layers change normals through Fresnel's equations only, and not through
+            the mirrored light. The separated pictures were computed with earlier normals. Normals that follow these
+            pictures would confirm their own errors.
+        behind: two distances behind the subject between which terms on normals and depth fade. The unit is the distance
+            of the cameras from the middle of the points, which nine tenths of the cameras do not exceed. Beyond the
+            second distance, these terms only rotate Gaussians (``training.behind``). Without fading, surfaces grow
+            behind the subject that agree with their normals but not with the pictures. None disables fading.
     """
 
     name: str
@@ -249,34 +266,37 @@ class Priors:
     """Settings of the polarization priors, which are computed from the frozen Gaussians.
 
     Attributes:
-        candidates: considered polarization normals: n, -n, R n, -R n of PolarGuide-GSDR ("paper"), the same with the
-            opposite azimuth in place of -n ("azimuths"), or the six that physics allows ("physical").
-        live: each step chooses the candidate nearest to the rendered normals, wherever the DoLP exceeds the threshold.
-            Otherwise, the frozen Gaussians choose, and pixels count only where they have a normal.
-        separation: separation that supervises the layers.
+        candidates: set of normals from which the polarization normal of a pixel is chosen. "paper" has the candidates
+            n, -n, R n and -R n of PolarGuide-GSDR. "azimuths" has normals of opposite azimuth in place of -n and -R n.
+            "physical" has the six normals that physics allows.
+        live: True if each step chooses the candidate nearest to the rendered normal, at every pixel with a DoLP above
+            the threshold. Otherwise, the frozen Gaussians choose, and pixels without a normal of these Gaussians are
+            ignored.
+        separation: method that separates specular and diffuse light to supervise the layers.
         threshold: DoLP above which the normal of a pixel is used.
-        full_dolp: DoLP above which the normal of a pixel counts fully; below, in proportion.
+        full_dolp: DoLP above which the normal of a pixel has full weight. Below it, the weight is proportional to the
+            DoLP.
         azimuth_weight: weight in [0, 1] of the azimuth, relative to the zenith, in the choice among candidates.
-        snr: ratio of the DoLP to its noise above which the normal of a pixel is used; 0: no test.
-        chromatic: use the polarization of color differences for the plane of incidence where it is decided.
-        chromatic_within: angles in degrees to the normal of the Gaussians between which the weight of normals of gray
-            bodies from color differences falls from 1 to 0. Under colored light, these normals have random directions.
-            None: no limit.
-        azimuth_share, chromatic_share: least share of the pixels over which the terms on directions are averaged, so
-            that a view with few polarized pixels has less influence than a fully polarized view.
-        bright: S0/2 above which consistency counts fully for any DoLP, and below in proportion, because depth is known
-            on bright surfaces. 0: the DoLP alone counts.
-        flat: search for large flat surfaces, whose normal a single view determines.
+        snr: ratio of the DoLP to its noise above which the normal of a pixel is used. 0 disables this test.
+        chromatic: True to use the polarization of color differences where it determines the plane of incidence.
+        chromatic_within: two angles in degrees. They limit the deviation of normals from color differences on gray
+            bodies, because colored light gives these normals random directions. The weight of such a normal falls from
+            1 at the first angle to the normal of the Gaussians to 0 at the second. None disables the limit.
+        azimuth_share, chromatic_share: least share of a picture's pixels by which the terms on directions are divided.
+            A view with few polarized pixels therefore has less influence than a fully polarized view.
+        bright: S0/2 above which the consistency term has full weight for any DoLP, because the depth of bright surfaces
+            is known. Below it, the weight is proportional to S0/2. With 0, only the DoLP determines the weight.
+        flat: True to search for large flat surfaces, whose normal a single view determines.
         flat_rules: constants of that search.
-        astray: degrees between the normal of the Gaussians and that of a flat surface above which the latter is used.
-            Smaller differences may be ripples.
-        minimum_normal: length of a blended normal above which it guides; shorter ones mix surfaces.
-        chromatic_plane_dolp: DoLP below which the plane of incidence of the color differences replaces that of the
-            AoLP.
-        full_certainty: certainty (``optics.chromatic_normals``) above which the normal of the color differences counts
-            fully.
-        gray: color contrasts between which a body changes from gray to colorful.
-        metal_share: metal shares between which a pixel changes from dielectric to metal.
+        astray: angle in degrees between the normal of the Gaussians and the normal of a flat surface. Above this angle,
+            the normal of the flat surface is used. Smaller differences may be ripples.
+        minimum_normal: length above which a blended normal is used as a guide. Shorter normals are mixtures of
+            surfaces.
+        chromatic_plane_dolp: DoLP below which the color differences determine the plane of incidence, not the AoLP.
+        full_certainty: certainty (``optics.chromatic_normals``) above which a normal from color differences has full
+            weight.
+        gray: two color contrasts. At the first, a body counts as gray, and at the second as fully colored.
+        metal_share: two metal shares. At the first, a pixel counts as a dielectric, and at the second as a metal.
     """
 
     candidates: Candidates = "physical"
@@ -306,12 +326,13 @@ class Propagation:
     """Normal propagation of 3DGS-DR (Ye et al. 2024, Sec. 3.3).
 
     Attributes:
-        opacity: lower bound of the opacities after it.
+        opacity: lower bound of the opacities after the propagation.
         color_noise: half-width of the noise on the base color of matte Gaussians.
         matte: largest strength of a matte Gaussian.
         glossy: smallest strength of a glossy Gaussian.
         widen: factor on the two longer scales of glossy Gaussians.
-        rest: steps without training of opacities afterwards (release), at most all steps over ``rest_part``.
+        rest: number of steps after a propagation in which opacities are not trained, as in the release of 3DGS-DR.
+        rest_part: divisor of the number of all steps. The quotient is an upper bound of ``rest``.
     """
 
     opacity: float = 0.9
@@ -328,9 +349,9 @@ class Coarse:
     """Smaller pictures in the first steps, in which Gaussians are too large for details.
 
     Attributes:
-        share: share of all steps.
-        factor: side of the averaged pixel boxes.
-        pixels: pixels of the largest training view above which there are such steps.
+        share: share of all steps that use smaller pictures.
+        factor: side in pixels of the squares that are averaged to one pixel.
+        pixels: number of pixels of the largest training view above which smaller pictures are used.
     """
 
     share: float = 0.5
@@ -344,16 +365,18 @@ class Recipe:
 
     Attributes:
         name: value of ``--recipe``.
-        about: one line.
+        about: description in one line.
         stages: stages in order; their fractions add up to 1.
-        rates: learning rates of the parameters of every recipe; that of the means is relative to the scene's extent.
-        shading: computation of the picture from Gaussians and learned light in stages with reflection.
-        means_decay: factor on the rate of the means at the last step, exponential in between.
-        oriented: normals keep the side from which training views see them (action "orient_normals").
-        metals: shares of all steps between which refreshes search for metals, if the shading model has metals.
+        rates: learning rates of the parameters that every recipe has. The rate of the means is relative to the scene's
+            extent.
+        shading: model that computes the picture from Gaussians and learned light in stages with reflection.
+        means_decay: factor on the rate of the means at the last step. The rate falls exponentially until then.
+        oriented: True if normals keep the side from which training views see them (action "orient_normals").
+        metals: two shares of all steps. Between them, each refresh of the priors searches for metals, if the shading
+            model supports metals.
         metal_rules: constants of the decision on metals.
         metal_views: constants of the measurements for that decision.
-        angle_rules: constants of the fits of polarizer angles and of their judgments.
+        angle_rules: constants for fitting and judging polarizer angles.
         coarse: steps with smaller pictures.
         sh_fractions: shares of all steps at which SH degrees 1, 2 and 3 begin.
         ssim_weight: lambda in (1 - lambda) L1 + lambda (1 - SSIM).
@@ -411,13 +434,13 @@ class Recipe:
 
     @property
     def shapes(self) -> dict[str, tuple[int, ...]]:
-        """Shape of one Gaussian's values for each tensor."""
+        """Shape of the values of one Gaussian, for each tensor."""
         own = {name: parameter.shape for name, parameter in self.shading.parameters.items()}
         return {**CORE_SHAPES, **(ORIENTED_SHAPES if self.oriented else {}), **own}
 
     @property
     def learning_rates(self) -> dict[str, float]:
-        """Learning rates of the trained per-Gaussian tensors, with those of the shading model."""
+        """Learning rates of all trained per-Gaussian tensors, including the tensors of the shading model."""
         own = {name: parameter.rate for name, parameter in self.shading.parameters.items() if parameter.rate}
         return {**self.rates, **own}
 
@@ -458,7 +481,7 @@ def _is_rate(value: object) -> bool:
 
 
 def check_recipe(recipe: Recipe, where: str) -> None:
-    """Check all values of a recipe of another package before a training.
+    """Check all values of a recipe that another package defines.
 
     Args:
         recipe: the recipe.
@@ -524,8 +547,8 @@ class Position:
 class Schedule:
     """Stages of a recipe, mapped to a number of steps.
 
-    In a training so short that a stage has no step, its ``on_enter`` runs with that of the next stage. The last stage
-    always has a step.
+    If a training is so short that a stage has no step, the next stage also runs the ``on_enter`` actions of this stage.
+    The last stage always has a step.
     """
 
     def __init__(self, recipe: Recipe, steps: int) -> None:
@@ -564,7 +587,7 @@ class Schedule:
         return sum(step >= f * self.steps for f in self.recipe.sh_fractions)
 
     def rates(self, step: int) -> dict[str, float]:
-        """Return the learning rates of a step by name; that of the means is relative to the scene's extent."""
+        """Return the learning rates of a step by name. The rate of the means is relative to the scene's extent."""
         factors = self.at(step).stage.rate_factors
         rates = {name: rate * factors.get(name, 1.0) for name, rate in self.recipe.learning_rates.items()}
         rates["means"] *= self.recipe.means_decay ** (step / max(1, self.steps - 1))

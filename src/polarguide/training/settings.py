@@ -14,7 +14,10 @@ MOST_VIEWS = 4096
 MOST_SEEDS = 2**63 - 1
 """Largest seed."""
 STEPS = 5000
-"""Least number of steps of a training of Gaussians, and number of steps of every run of a comparison."""
+"""Lower bound of the default number of steps of a training of Gaussians.
+
+All runs of a comparison have this number of steps.
+"""
 Background = Literal["auto", "scene", "black", "masked"]
 Materials = Literal["auto", "dielectric"]
 MATERIALS: tuple[Materials, ...] = get_args(Materials)
@@ -81,8 +84,8 @@ class TrainSettings:
 class ResolvedSettings:
     """Complete settings of a training, as ``run.json`` records them.
 
-    ``runs.folder.resolve`` creates them from ``TrainSettings``, which explains the fields. ``gaussians`` is 0 for a
-    field, which has no Gaussians.
+    ``runs.folder.resolve`` creates them from ``TrainSettings``, where the fields are explained. ``gaussians`` is 0 for
+    a method without Gaussians, such as a signed-distance field.
     """
 
     steps: int
@@ -104,7 +107,7 @@ class ResolvedSettings:
 
 
 def _check_ranges(values: Mapping[str, Any], *, least_gaussians: int) -> None:
-    """Check settings by name; None is not specified.
+    """Check that settings are in range, by name. None means that a setting is not specified.
 
     Raises:
         PolarguideError: a value is out of range.
@@ -132,15 +135,15 @@ def _check_ranges(values: Mapping[str, Any], *, least_gaussians: int) -> None:
 
 @dataclass(frozen=True, eq=False)
 class StepReport:
-    """Report of a step.
+    """Report of a training step, which callbacks receive after the step.
 
     Attributes:
         step: number of the step, 0-based.
         stage: name of the stage.
-        gaussians: number of Gaussians; None for a method without Gaussians.
-        measured: [3] photometric loss, PSNR and total loss, means over the views of this rank, on the device. Reading
-            them waits for the device.
-        done: number of finished steps, with those before the training began again.
+        gaussians: number of Gaussians. None for a method without Gaussians.
+        measured: [3] photometric loss, PSNR and total loss, averaged over the views of this rank. The tensor is on the
+            device, so reading its values waits for the device.
+        done: number of all finished steps. It includes the steps of earlier schedules, such as a search for angles.
     """
 
     step: int

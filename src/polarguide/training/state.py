@@ -21,7 +21,10 @@ from polarguide.training.recipe import Recipe
 HOLDERS = ("callback.", "frozen.", "statistics.")
 """Prefixes of the names of tensors that callbacks hold."""
 ANGLE_COLUMNS = 8
-"""Number of values of a fitted polarizer angle: those of ``angles.fit.FittedAngle``, and 1 for a successful fit."""
+"""Number of stored values for a fitted polarizer angle.
+
+These are the values of ``angles.polarizers.FittedAngle``, and a flag that is 1 for a successful fit.
+"""
 
 
 class Environment(Trained):
@@ -47,7 +50,7 @@ class Environment(Trained):
 
     @staticmethod
     def _moments(name: str) -> str:
-        """Return the prefix of a tensor's moments; the first checkpoints had the moments of the texels alone."""
+        """Return the prefix for the moments of a tensor. The prefix for ``texels`` is that of the first version."""
         return "environment.adam." if name == "texels" else f"environment.adam.{name}."
 
 
@@ -89,10 +92,10 @@ class TrainingState:
         step: the next step, 0-based.
         gaussians: the Gaussians.
         environment: the learned light; None if the shading model has none.
-        opacity_frozen_until: first step at which opacities train again after surface normals were propagated.
-        angles: [F, P, ``ANGLE_COLUMNS``] float64, polarizers of P pictures in F successive fits, see
-            ``angles.polarizers``; None before the first fit.
-        footprints: [N] size of a training pixel at each Gaussian, see ``raster.magnification``; None before the end of
+        opacity_frozen_until: first step at which opacities are trained again after a propagation of normals.
+        angles: [F, P, ``ANGLE_COLUMNS``] float64, fitted angles of P pictures in F successive fits, see
+            ``angles.polarizers``. None before the first fit.
+        footprints: [N] size of a training pixel at each Gaussian, see ``raster.magnification``. None before the end of
             the training.
         extra: tensors of holders that are not attached, by their names in a checkpoint.
         holders: attached holders by prefix.
@@ -153,7 +156,7 @@ class TrainingState:
 
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, Tensor], recipe: Recipe) -> TrainingState:
-        """Return the state of ``tensors``; ``refuse_foreign`` checks tensors of a file first."""
+        """Create a state from tensors; tensors of a file must pass ``refuse_foreign`` first."""
         rates = recipe.light_rates
         step, frozen_until = (int(value) for value in tensors["scalars"])
         return cls(
@@ -168,7 +171,7 @@ class TrainingState:
 
 
 def seeded(*numbers: int) -> torch.Generator:
-    """Return a generator seeded with all the numbers: draws do not depend on earlier draws."""
+    """Return a random generator whose seed combines all the numbers; its values do not depend on other generators."""
     value = 0
     for number in numbers:
         value = (value * 1_000_003 + number + 1) % (2**63 - 1)
@@ -200,8 +203,8 @@ def _check_first_values(
 def first_state(context: TrainingContext) -> TrainingState:
     """Return the state before the first step, without the tensors of callbacks.
 
-    Values are drawn on the CPU, so that every device begins with the same. Far Gaussians are added unless nothing is
-    behind the subject.
+    Random values are drawn on the CPU, so that they are the same on every device. Distant Gaussians are added unless
+    the subject has no background.
 
     Raises:
         PolarguideError: first values of the shading model differ from its declared parameters.

@@ -1,8 +1,9 @@
 """Cache of computed data of training views, in memory up to a limit and in a file beyond it.
 
-Targets are rounded to whole numbers of 1/32767 of the largest value of their picture, at any size of the scene, so that
-a result does not depend on their storage. That is a hundredth of a degree of a normal, and an eighth of a step of an
-8-bit picture at full scale. Every entry can be computed again to the same bits.
+Targets are always rounded to multiples of 1/32767 of the largest value of their picture, also if they stay in memory.
+Results therefore do not depend on the place of storage. The rounding changes a normal by at most about a hundredth of a
+degree. It corresponds to an eighth of a step of an 8-bit picture at full scale. Every entry can be recomputed to
+exactly the same values.
 """
 
 from __future__ import annotations
@@ -26,8 +27,8 @@ class Packed(NamedTuple):
     """A cached tensor.
 
     Attributes:
-        codes: int16, or the tensor itself if it was not coded.
-        top: value of the code 32767, a scalar; None: not coded.
+        codes: int16 codes, or the tensor itself if it was not coded.
+        top: value of the code 32767, a scalar. None if the tensor was not coded.
     """
 
     codes: Tensor
@@ -54,7 +55,7 @@ def packed(values: Tensor) -> Packed:
 
 
 def stored_values(entry: Packed) -> Tensor:
-    """Return the values of a packed tensor; coded ones as float32."""
+    """Return the values of a packed tensor. Coded tensors become float32."""
     if entry.top is None:
         return entry.codes
     # Division by 32767 restores a 1 exactly; a product with its inverse does not.
@@ -67,8 +68,8 @@ class _FileSlot:
     """Slot of an entry in the file.
 
     Attributes:
-        offset, size: place of the slot in bytes.
-        length: bytes of the entry; 0: no entry.
+        offset, size: position and size of the slot in bytes.
+        length: size of the entry in bytes; 0 if the slot is free.
         tops: scales of the tensors by name.
     """
 
@@ -79,16 +80,17 @@ class _FileSlot:
 
 
 class ViewStore:
-    """Cache of entries by kind and view.
+    """Cache of computed data, with entries by kind and view.
 
-    An entry stays in memory or in the file, whichever it came to first. Views are visited in changing order, so that
-    the least recently used entry is not the last to be used, and exchanging entries would only write more.
+    An entry stays where it was first stored, in memory or in the file. Entries are not exchanged, because views are
+    visited in random order. Removing the least recently used entry from memory would only cause more writes.
 
     Args:
-        limit: bytes of entries in memory; None: no limit.
-        folder: folder of the file, which has no name and ends with the process; None: entries beyond the limit are
-            computed again.
-        warn: receives a message if the file cannot be written; entries beyond the limit are then computed again.
+        limit: largest number of bytes in memory. None means no limit.
+        folder: folder of the file. The file has no name and disappears with the process. With None, entries beyond the
+            limit are recomputed at each use.
+        warn: receives a message if the file cannot be written. Entries beyond the limit are then recomputed at each
+            use.
     """
 
     def __init__(
@@ -107,12 +109,12 @@ class ViewStore:
         self.in_file = 0
 
     def get(self, kind: str, view: str, make: Callable[[], Entry], *, disposable: bool = False) -> Entry:
-        """Return an entry; a missing one is computed.
+        """Return an entry, and compute it if it is missing.
 
         Args:
             kind, view: key of the entry.
             make: computes the entry.
-            disposable: beyond the limit, compute the entry again and do not write it to the file.
+            disposable: True to recompute the entry if it is beyond the limit, instead of writing it to the file.
         """
         key = (kind, view)
         entry = self._entries.get(key) or self._read(key)
@@ -122,10 +124,10 @@ class ViewStore:
         return entry
 
     def drop(self, kind: str, view: str | None = None) -> None:
-        """Drop the entries of a kind, or one of them.
+        """Drop all entries of a kind, or the entry of one view.
 
-        A new entry takes the slot of the dropped one in the file if it fits. A larger one is appended, and the slot
-        stays empty; entries grow only when a stage reads more than the previous one.
+        A new entry reuses the slot of the dropped entry in the file if it fits. A larger entry is appended, and the old
+        slot stays empty. Entries grow only if a stage needs more data than the previous stage.
         """
         for key in [key for key in self._entries if key[0] == kind and view in (None, key[1])]:
             self.in_memory -= _size(self._entries.pop(key))

@@ -1,4 +1,4 @@
-"""Targets of the rendering of a step: records of the data of one view."""
+"""Targets to which a rendering is compared: records of the data of one view."""
 
 from __future__ import annotations
 
@@ -23,23 +23,23 @@ ABSENT = torch.tensor(torch.nan)
 
 @dataclass(frozen=True, eq=False)
 class ViewPriors:
-    """Polarization targets of one view; fields that no term reads are ``ABSENT``.
+    """Polarization targets of one view. Fields that no loss term reads are ``ABSENT``.
 
     Attributes:
         camera: camera of the view.
         specular, diffuse: [H, W, 3] separated pictures as displayed (sRGB), on the scale of S0/2.
-        separated: [H, W] weight of both: 1 where the separation is well conditioned.
+        separated: [H, W] weight of these pictures: 1 where the separation is well conditioned, else 0.
         normal: [H, W, 3] disambiguated polarization normal, world axes.
         plane: [H, W, 3] normal of the plane of incidence according to the AoLP, world axes.
         weight: [H, W] weight of ``normal`` and ``plane``, in [0, 1].
         chromatic: [H, W, 3] normal from the polarization of color differences or of a flat surface, world axes.
-        chromatic_weight: [H, W] its weight, in [0, 1]; 0 if the settings do not request it.
+        chromatic_weight: [H, W] weight of ``chromatic``, in [0, 1]; 0 if the settings do not request this normal.
         stokes: [3, H, W, 3] measured Stokes vectors.
         stokes_weight: [H, W] weight of S1 and S2, see ``stokes_weight``.
         surface: [H, W] weight of the agreement of normals and depth, see ``surface_weight``.
-        candidates: [H, W, K, 3] normals from which each step chooses in place of ``normal``, world axes; None: no
-            choice.
-        azimuth_share, chromatic_share: least share of the pixels over which the terms on directions are averaged.
+        candidates: [H, W, K, 3] normals from which each step chooses in place of ``normal``, world axes. None if
+            ``normal`` is used.
+        azimuth_share, chromatic_share: least share of the pixels by which sums of the terms on directions are divided.
     """
 
     camera: Camera
@@ -60,12 +60,12 @@ class ViewPriors:
 
     @cached_property
     def total(self) -> Tensor:
-        """Divisor of sums with ``weight``: its sum, or the least share of the pixels."""
+        """Divisor of means with ``weight``: the sum of the weights, but at least ``azimuth_share`` of all pixels."""
         return _total(self.weight, self.azimuth_share)
 
     @cached_property
     def chromatic_total(self) -> Tensor:
-        """Divisor of sums with ``chromatic_weight``: its sum, or the least share of the pixels."""
+        """Divisor of means with ``chromatic_weight``: its sum, but at least ``chromatic_share`` of all pixels."""
         return _total(self.chromatic_weight, self.chromatic_share)
 
 
@@ -74,11 +74,13 @@ def _total(weight: Tensor, share: float) -> Tensor:
 
 
 def stokes_weight(stokes: Tensor, reliable: Tensor) -> Tensor:
-    """Return the weight [H, W] of S1 and S2: one over the root of S0, since the variance of photon noise grows with S0.
+    """Return the weight [H, W] of S1 and S2, which is one over the square root of S0.
+
+    The variance of photon noise is proportional to S0.
 
     Args:
         stokes: [3, H, W, 3] measured Stokes vectors.
-        reliable: [H, W] 1 where the measurement counts, 0 elsewhere.
+        reliable: [H, W] 1 where the measurement is reliable, 0 elsewhere.
     """
     return reliable * (stokes[0].mean(dim=-1) + 0.01).rsqrt()
 
@@ -89,7 +91,7 @@ def surface_weight(stokes: Tensor, weight: Tensor, bright: float) -> Tensor:
     Args:
         stokes: [3, H, W, 3] measured Stokes vectors.
         weight: [H, W] weight of the polarization normal.
-        bright: S0/2 above which the agreement counts fully; 0: it counts as much as the polarization normal.
+        bright: S0/2 above which the agreement has full weight. With 0, it has the weight of the polarization normal.
     """
     if not bright:
         return weight
@@ -102,12 +104,12 @@ class PartialView:
     """Measurements of a view whose pictures do not determine the Stokes vector.
 
     Attributes:
-        picture: [H, W, 3] linear: mean of some of its exposures.
-        shown: the same as displayed (sRGB), clipped.
-        mix: analyzer of ``picture``, [2], or [2, H, W] if it depends on the pixel; None: ``picture`` is S0/2.
-        intensities: [K, H, W, 3] linear, of the exposures behind a polarizer at a known angle.
-        analyzers: their analyzers, [K, 2] or [K, 2, H, W].
-        reliable: [H, W] 1 where the measurement counts, 0 where it is invalid or saturated.
+        picture: [H, W, 3] linear radiance, the mean of some exposures of the view.
+        shown: [H, W, 3] ``picture`` as displayed (sRGB), clipped.
+        mix: analyzer of ``picture``, [2], or [2, H, W] if it depends on the pixel. None if ``picture`` is S0/2.
+        intensities: [K, H, W, 3] linear intensities of the exposures behind a polarizer at a known angle.
+        analyzers: analyzers of ``intensities``, [K, 2] or [K, 2, H, W].
+        reliable: [H, W] 1 where the measurement is usable, 0 where it is invalid or saturated.
     """
 
     picture: Tensor
@@ -149,10 +151,10 @@ class StepTargets:
     Attributes:
         camera: camera of the view.
         picture: [H, W, 3] the photograph as displayed (sRGB).
-        valid: [H, W] 1 where the photograph counts; None: everywhere.
-        empty: [H, W] 1 where the view is empty; None: unknown.
-        partial: measurements of a view that does not determine the Stokes vector; None: it does.
-        priors: polarization targets; None: no term of the stage reads them, or the view has none.
+        valid: [H, W] 1 where the photograph is valid, else 0. None means valid everywhere.
+        empty: [H, W] 1 where the view shows no surface, else 0. None means unknown.
+        partial: measurements of a view that does not determine the Stokes vector. None if the view determines it.
+        priors: polarization targets. None if no term of the stage reads them, or if the view has no priors.
     """
 
     camera: Camera
@@ -169,12 +171,12 @@ class Step:
 
     Attributes:
         result: the rendered layers.
-        targets: their targets.
-        shading: shading of the stage, for the refractive index of the run.
-        log_scales: [N, 3] scales of the Gaussians.
+        targets: targets of the rendered layers.
+        shading: shading model of the stage, with the refractive index of the run.
+        log_scales: [N, 3] logarithms of the scales of the Gaussians.
         extent: extent of the scene.
         ssim_weight: lambda of the image terms.
-        statistic: gradient of the projected means after the backward pass; None without density control.
+        statistic: gradient of the projected means, known after the backward pass. None without density control.
     """
 
     result: RenderResult

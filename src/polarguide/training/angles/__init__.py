@@ -1,1 +1,1 @@
-"""Angles of polarizers: fitted to pictures, sought in short trainings where they are unknown, and judged."""
+"""Polarizer angles: fits to pictures, searches for unknown angles, and checks of known angles."""

@@ -1,4 +1,7 @@
-"""Fits of polarizer angles between the steps of a training: unknown angles, and known ones to check them."""
+"""Fits of polarizer angles between the steps of a training.
+
+Unknown angles are estimated. Known angles are fitted as well, to check the specified values.
+"""
 
 from __future__ import annotations
 
@@ -23,19 +26,20 @@ from polarguide.training.storage import ViewStore
 
 
 class AngleFits(Callback[TrainingLoop]):
-    """Fits of polarizer angles, after which the loop begins again with the angles that a search has found.
+    """Callback that fits polarizer angles during a training.
 
-    Unknown angles are searched for in short trainings on small pictures. With ``TrainSettings.begin_again`` off there
-    is no search, and they are fitted between steps of the training. Known angles are compared with the pictures there.
+    Short trainings on small pictures search for unknown angles. Then the training begins again with the angles
+    that were found. If ``TrainSettings.begin_again`` is False, there is no search, and unknown angles are fitted
+    between the steps of the training. Known angles are compared with the pictures between these steps.
 
     Args:
         context: context of the training.
-        table: table of all fits so far; None: no fit so far.
+        table: table of all earlier fits. None means that there was no fit.
 
     Attributes:
         polarizers: fitted angles.
-        begins_again: True if the training begins, or has begun, after a search.
-        current: context of the next schedule: a search, or the training.
+        begins_again: True if a search precedes the training.
+        current: context of the next schedule, which is a search or the training itself.
     """
 
     def __init__(self, context: TrainingContext, table: Tensor | None) -> None:
@@ -43,7 +47,7 @@ class AngleFits(Callback[TrainingLoop]):
         self._schedule_next(table)
 
     def _schedule_next(self, table: Tensor | None) -> None:
-        """Choose the schedule of the next search, or of the training if all angles are found."""
+        """Choose the next schedule: another search, or the training if all angles have been found."""
         context = self._context
         scene = context.scene
         steps = context.settings.steps
@@ -63,7 +67,7 @@ class AngleFits(Callback[TrainingLoop]):
             self.current = replace(context, scene=self.polarizers.resolved(scene))
 
     def begin(self, loop: TrainingLoop) -> None:
-        """Apply the fits so far."""
+        """Apply the earlier fits."""
         loop.state.angles = self.polarizers.table
         if self.begins_again:
             loop.offset = self.polarizers.searched
@@ -72,7 +76,7 @@ class AngleFits(Callback[TrainingLoop]):
             loop.feed.set_exposures(self.polarizers.beliefs)
 
     def before_step(self, loop: TrainingLoop, position: Position) -> None:
-        """Fit angles if that is due."""
+        """Fit angles if a fit is due before this step."""
         if not self.polarizers.due(loop.state.step):
             return
         loop.whole = False
@@ -113,12 +117,15 @@ class AngleFits(Callback[TrainingLoop]):
 def gaussian_training(
     context: TrainingContext, state: TrainingState | None = None, callbacks: Iterable[AnyCallback] = ()
 ) -> tuple[TrainingLoop, AngleFits]:
-    """Return the loop that trains Gaussians with fits of polarizer angles, and these fits.
+    """Create the loop of a training of Gaussians, with a callback that fits polarizer angles.
 
     Args:
         context: context of the training.
-        state: state to resume from, also in the middle of a search; None: from the beginning.
-        callbacks: further callbacks, which come after those of the method.
+        state: state to resume from, which may be in the middle of a search. None starts from the beginning.
+        callbacks: additional callbacks, which run after the callbacks of the method.
+
+    Returns:
+        A tuple of the loop and its callback that fits the angles.
     """
     fits = AngleFits(context, None if state is None else state.angles)
     return TrainingLoop(context, [fits, *method_callbacks(), *callbacks], state, fits.current), fits

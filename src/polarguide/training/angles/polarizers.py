@@ -1,6 +1,7 @@
-"""Polarizer angles as a training estimates them: unknown angles, and contradicted known ones.
+"""Estimation of polarizer angles in a training, and judgments on their reliability.
 
-The angle and the gain of a picture behind a polarizer follow in closed form from predicted Stokes vectors.
+Unknown angles are estimated, and known angles are checked for contradictions. The model predicts Stokes vectors, from
+which the angle and the gain of a picture behind a polarizer follow by least squares.
 """
 
 from __future__ import annotations
@@ -26,13 +27,13 @@ from polarguide.training.settings import ResolvedSettings
 from polarguide.training.state import ANGLE_COLUMNS
 
 ROUNDS = 6
-"""Number of least-squares fits in the approximation of least absolute differences."""
+"""Number of reweighted least-squares fits that approximate the minimum of absolute differences."""
 SOFT = 0.001
 """Intensity difference below which the weight of a pixel stays constant."""
 FLOOR = 0.02
 """S0 below which the weight of a pixel stays constant."""
 BLOCK = 16
-"""Side of the squares of pixels whose errors may be correlated."""
+"""Side in pixels of the squares within which errors may be correlated."""
 
 
 @dataclass(frozen=True)
@@ -40,14 +41,14 @@ class FittedAngle:
     """Polarizer angle fitted to a picture.
 
     Attributes:
-        angle: degrees in [0, 180), as ``Exposure.angle``.
-        gain: brightness over the predicted one.
-        modulation: polarization of the picture over the predicted one: 1 behind a polarizer, 0 without a polarizer,
-            above 1 if the prediction is too small.
-        spread: standard deviation of the angle, degrees; at most 90.
+        angle: angle in degrees in [0, 180), as ``Exposure.angle``.
+        gain: brightness of the picture over its predicted brightness.
+        modulation: polarization of the picture over its predicted polarization. It is 1 behind a polarizer, 0 without a
+            polarizer, and above 1 if the prediction is too small.
+        spread: standard deviation of the angle in degrees, at most 90.
         doubt: standard deviation of the modulation, at most 1.
         misfit: mean residual over the mean light of the picture.
-        misfit_across: the same with the polarizer turned by 90 degrees.
+        misfit_across: mean residual for the polarizer turned by 90 degrees, over the mean light of the picture.
     """
 
     angle: float
@@ -62,22 +63,23 @@ class FittedAngle:
 def fit_angle(
     intensity: Tensor, stokes: Tensor, weight: Tensor, rays: Tensor, mount: Mount
 ) -> FittedAngle | None:
-    """Fit ``I = (g S0 + x S1 + y S2) / 2`` with g the gain and (x, y) = g (cos 2t, sin 2t) of the angle t.
+    """Fit the polarizer angle t and the gain g of a picture to predicted Stokes vectors.
 
-    Iteratively reweighted least squares minimize the absolute differences over the square of S0. Unexplained light thus
-    has little influence on the angle: errors of a prediction grow with the light, and dark surfaces are polarized most.
-    A filter in front of the lens has an analyzer that depends on the pixel; there, (x, y) rotates the analyzer of the
-    previous round.
+    The model is ``I = (g S0 + x S1 + y S2) / 2`` with (x, y) = g (cos 2t, sin 2t). Iteratively reweighted least squares
+    minimize the absolute differences over the square of S0. Prediction errors grow with the light, and dark surfaces
+    have the highest degrees of polarization. Light that the model cannot explain therefore has little influence on the
+    angle. The analyzer of a filter in front of the lens depends on the pixel. For such a filter, (x, y) rotates the
+    analyzer of the previous iteration.
 
     Args:
-        intensity: [H, W, 3] linear.
+        intensity: [H, W, 3] linear intensities of the picture.
         stokes: [3, H, W, 3] predicted Stokes vectors.
-        weight: [H, W], 0 for pixels without a measurement.
-        rays: [H, W, 3] unit, camera axes.
+        weight: [H, W] weights of the pixels, 0 for pixels without a measurement.
+        rays: [H, W, 3] unit directions from the camera, camera axes.
         mount: place of the polarizer.
 
     Returns:
-        None without polarization that determines an angle.
+        The fitted angle, or None if there is no polarization that determines it.
     """
     flat = (weight / (stokes[0].mean(dim=-1).clamp(min=0) + FLOOR) ** 2)[..., None].expand_as(intensity)
     plain = flat.reshape(-1).double()
@@ -110,7 +112,7 @@ def fit_angle(
     if gain <= 0 or length == 0:
         return None
     covariance = _covariance(columns, plain, y - solution @ columns, intensity.shape)
-    if mount == "filter":  # in the analyzer of the last round, the second component is almost 0
+    if mount == "filter":  # relative to the analyzer of the previous iteration, the second component is almost 0
         x = length
         y2 = 0.0
     across = torch.tensor([0.0, -y2, x], dtype=torch.float64) / length
@@ -127,10 +129,10 @@ def fit_angle(
 
 
 def _covariance(columns: Tensor, weights: Tensor, residuals: Tensor, shape: tuple[int, ...]) -> Tensor:
-    """Return the covariance [3, 3] of a solution by least absolute differences.
+    """Return the covariance [3, 3] of a solution that minimizes absolute differences.
 
-    This is the sandwich estimator. The density of the residuals at zero follows from those below their median. Errors
-    may be correlated within blocks of side ``BLOCK``.
+    It is a sandwich estimate. The density of the residuals at zero is estimated from the residuals below their median.
+    Errors may be correlated within squares of side ``BLOCK``.
     """
     width = residuals[weights > 0].abs().median().clamp(min=1e-9)
     slope = (columns * (weights * (residuals.abs() <= width) / width)) @ columns.T
@@ -145,31 +147,35 @@ REMEDY = (
     "Note the angle of each shot; or take three or four shots of each view at known angles, from a tripod; or treat "
     "the pictures as ordinary photographs: prepare them with --angles none."
 )
-"""Advice for captures with mostly doubtful angles."""
+"""Advice for captures in which most angles are doubtful."""
 UNFITTED = (0.0, 1.0, 0.0, 90.0, 1.0, 0.0, 0.0)
-"""Values of ``FittedAngle`` for a picture without polarization to fit an angle to."""
+"""Values of ``FittedAngle`` for a picture without polarization that determines an angle."""
 Predict = Callable[[View], Tensor]
 """Function that predicts the Stokes vectors [3, H, W, 3] of a view from the current state."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Judgment(FittedAngle):
-    """Judgment of a training on the polarizer angle of a picture.
+    """Reliability of the polarizer angle of a picture, according to the fits of a training.
 
-    ``angle`` is the mean of the fits that determine one, or else of those that are a best guess. The other values of
-    ``FittedAngle`` are those of the last of these fits.
+    ``angle`` is the mean of the fits that determine an angle. If no fit determines one, it is the mean of the fits that
+    are usable as a best guess. The other values of ``FittedAngle`` are taken from the last of these fits.
 
     Attributes:
         view: name of the view.
         number: index of the picture among the exposures of the view.
         specified: exposure of the capture.
         believed: exposure that the training assumes.
-        scatter: scatter of the angles about their mean, degrees; 90 if less than half of the fits determine one.
-        usual: median deviation of the pictures with a determined angle in the same fit, which measures the prediction.
-        unexplained: misfit of the last fit over the median of all pictures, times the misfit over that across. It is
-            large for a picture with a worse explanation than others, and hardly a better one than by a turned
-            polarizer.
-        overruled: the other pictures of the view contradict a wrong angle; see ``Polarizers._overruled``.
+        scatter: scatter of the fitted angles about their mean in degrees; 90 if less than half of the fits determine an
+            angle.
+        usual: median difference in degrees between fitted and specified angles, over pictures with a determined angle
+            in the same fit. It measures how well the model predicts polarization.
+        unexplained: product of two ratios of the last fit. The first is the misfit over the median misfit of all
+            pictures. The second is the misfit over the misfit with the polarizer turned by 90 degrees. The product is
+            large for a picture that the model explains worse than the other pictures, and hardly better than with a
+            turned polarizer.
+        overruled: True if the other pictures of the view show that its angle is not wrong; see
+            ``Polarizers._overruled``.
         rules: constants of the judgment.
     """
 
@@ -205,12 +211,12 @@ class Judgment(FittedAngle):
 
     @property
     def unsettled(self) -> bool:
-        """True if the picture determines an angle on which the fits disagree."""
+        """True if the picture determines an angle in each fit, but the fits disagree."""
         return self.tells and self.scatter > self.rules.disagree
 
     @property
     def poorly_explained(self) -> bool:
-        """True if the scene explains the picture poorly, so that its determined angle may be wrong."""
+        """True if the model explains the picture poorly, so that the fitted angle may be wrong."""
         return self.tells and self.unexplained > self.rules.poor
 
     @property
@@ -225,7 +231,7 @@ class Judgment(FittedAngle):
         return not (self.unfiltered or self.overruled) and self.estimate.contradicts
 
     def resembles(self, other: Judgment) -> bool:
-        """Return True if the fitted angle equals the specified angle of another picture, within its spread."""
+        """Return True if the fitted angle equals the specified angle of another picture within its spread."""
         return not replace(self.estimate, stated=other.specified.angle or 0.0, usual=0.0).contradicts
 
     @property
@@ -236,23 +242,24 @@ class Judgment(FittedAngle):
 
 
 class Polarizers:
-    """Pictures behind polarizers to fit, and their fits.
+    """Pictures behind polarizers whose angles are fitted, and the results of all fits.
 
-    Pictures of a polarization camera are left out, and all pictures if the recipe does not use them. Angles are fitted
-    in the second half of a schedule. If the training begins again with them, they are fitted in two searches; the
-    second begins with the angles of the first.
+    Pictures of a polarization camera are skipped. All pictures are skipped if the recipe does not use pictures behind
+    filters. If there are searches, unknown angles are fitted in two of them, and the second search begins with the
+    angles of the first. Otherwise they are fitted in the second half of the training.
 
     Args:
         scene: the capture.
         recipe: the method.
         steps: steps of the training.
-        table: earlier fits, [F, P, 8] float64, results of ``fit``; None: no fit.
-        search: steps of the schedule of a search for unknown angles; 0: the training does not begin again.
+        table: results of F earlier calls of ``fit`` for P pictures, [F, P, 8] float64. None means that there was no
+            fit.
+        search: number of steps of a search for unknown angles. 0 means that there is no search.
 
-    Attributes:
-        table: all fits.
-        beliefs: assumed exposures of fitted views by the name of the view.
-        ignored: the recipe ignores the filters of some pictures.
+        Attributes:
+            table: results of all fits.
+            beliefs: exposures that the training assumes for fitted views, by the name of the view.
+            ignored: True if the recipe ignores the filters of some pictures.
 
     Raises:
         ValueError: the table has another number of rows.
@@ -302,7 +309,7 @@ class Polarizers:
 
     @property
     def search(self) -> int:
-        """Number of steps until unknown angles are found; 0 without unknown angles."""
+        """Number of steps of all searches for unknown angles; 0 if all angles are known."""
         return sum(times[-1] for times in self._rounds) if self._unknown else 0
 
     @property
@@ -311,12 +318,12 @@ class Polarizers:
         return sum(times[-1] for times in self._rounds[: self.ended]) if self._unknown else 0
 
     def believed(self, view: View) -> View:
-        """Return a view with its assumed exposures."""
+        """Return a view with the exposures that the training assumes for it."""
         exposures = self.beliefs.get(view.name)
         return view if exposures is None or exposures == view.exposures else view.with_exposures(exposures)
 
     def resolved(self, scene: Scene) -> Scene:
-        """Return a scene with its assumed exposures."""
+        """Return a scene with the exposures that the training assumes for its views."""
         return replace(scene, views=tuple(self.believed(view) for view in scene.views))
 
     def fit(self, predict: Predict) -> Tensor:
@@ -326,7 +333,8 @@ class Polarizers:
             predict: predicts the Stokes vectors of a view.
 
         Returns:
-            [P, 8] float64: the values of ``FittedAngle`` of each picture, and 1 for a successful fit.
+            Results [P, 8] float64. Columns 0 to 6 are the values of ``FittedAngle``. Column 7 is 1 if the fit
+            succeeded, else 0.
         """
         rows = []
         for view in self._views:
@@ -342,7 +350,7 @@ class Polarizers:
         return torch.tensor(rows, dtype=torch.float64).reshape(-1, ANGLE_COLUMNS)
 
     def take(self, table: Tensor) -> set[str]:
-        """Use a table of all fits [F, P, 8]; return the names of the views with changed exposures."""
+        """Adopt a table of all fits [F, P, 8], and return the names of the views whose exposures have changed."""
         self.table = table
         earlier = self.beliefs
         self.beliefs = self._beliefs()
@@ -353,7 +361,7 @@ class Polarizers:
         if self.table is None:
             return []
         common = self._common_gain(self.table[-1])
-        # Fits of the latest search only, because earlier ones are worse.
+        # Only fits of the latest search are used, because earlier fits are worse.
         ends = itertools.accumulate(map(len, self._rounds), initial=0)
         latest = self.table[max(end for end in ends if end < len(self.table)) :]
         fits = zip(*map(self._judged, latest), strict=True)
@@ -377,10 +385,12 @@ class Polarizers:
         return [replace(judgment, overruled=self._overruled(judgment, judgments)) for judgment in judgments]
 
     def _overruled(self, judgment: Judgment, judgments: Sequence[Judgment]) -> bool:
-        """Return True if a picture contradicts its angle, and the other pictures of its view, at least three, do not.
+        """Return True if the other pictures of the view show that a contradicted angle is right.
 
-        Four pictures determine more than a Stokes vector: a single wrong angle breaks their pair sums, which
-        ``prepare`` and ``inspect`` check. Only two exchanged pictures keep the sums, and each resembles the other.
+        This requires at least three other pictures that do not contradict their angles. Four pictures determine more
+        than a Stokes vector. A single wrong angle makes the sums of perpendicular pairs differ, which ``prepare`` and
+        ``inspect`` check. The sums stay equal only if two pictures are exchanged, and then each of them resembles the
+        other.
         """
         if not judgment.contradicts:
             return False
@@ -394,7 +404,7 @@ class Polarizers:
         )
 
     def _judged(self, fit: Tensor) -> list[Judgment]:
-        """Return the judgment of each picture by one fit [P, 8]."""
+        """Return the judgment of each picture according to a single fit [P, 8]."""
         rows = [
             Judgment(
                 *row[:-1],
@@ -411,7 +421,10 @@ class Polarizers:
         return [replace(row, usual=usual) for row in rows]
 
     def _common_gain(self, fit: Tensor) -> float | None:
-        """Return the median gain as a reference; None if gains differ as little as those of locked exposures."""
+        """Return the median gain as a reference for single gains.
+
+        Return None if the gains differ so little that all exposures are treated as equal.
+        """
         rows = [row for (view, k), row in zip(self._places, fit, strict=True) if not view.exposures[k].known]
         gains = [float(row[1]) for row in rows if row[-1]]
         if len(gains) < self._rules.fewest:
@@ -429,17 +442,20 @@ class Polarizers:
 
 
 def predicts_filters(recipe: Recipe) -> bool:
-    """Return True if a recipe learns from pictures behind filters: it renders S0, S1 and S2."""
+    """Return True if a recipe learns from pictures behind filters.
+
+    Such a recipe renders S0, S1 and S2.
+    """
     return recipe.shading.reflects and any(stage.weights.stokes > 0 for stage in recipe.stages)
 
 
 def search_steps(recipe: Recipe, settings: ResolvedSettings) -> int:
-    """Return the steps of the schedule of a search for unknown angles; 0: the training does not begin again."""
+    """Return the number of steps of a search for unknown angles, or 0 if there is no search."""
     return min(recipe.angle_rules.search_steps, settings.steps) if settings.begin_again else 0
 
 
 def _unexplained(fit: Tensor) -> list[float]:
-    """Return ``Judgment.unexplained`` of each picture by a fit [P, 8]; 0 for unfitted pictures."""
+    """Return ``Judgment.unexplained`` of each picture in a fit [P, 8]; 0 for pictures without a fitted angle."""
     misfit, across, counted = fit[:, -3:].unbind(1)
     middle = misfit[counted > 0].median() if bool(counted.any()) else misfit.new_ones(())
     values: list[float] = (misfit**2 / (middle * across).clamp(min=1e-12)).tolist()
@@ -447,7 +463,10 @@ def _unexplained(fit: Tensor) -> list[float]:
 
 
 def _belief(judgment: Judgment, common: float | None) -> Exposure:
-    """Return the exposure assumed for a picture without a specified angle: a photograph if no angle was fitted."""
+    """Return the exposure that is assumed for a picture without a specified angle.
+
+    A picture without a fitted angle is treated as a photograph without a filter.
+    """
     specified = judgment.specified
     if judgment.unfiltered:
         return replace(specified, filtered=False)

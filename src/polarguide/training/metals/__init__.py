@@ -1,1 +1,1 @@
-"""Which Gaussians are metals, found from what all views measured of them and from what the user says."""
+"""Search for metals among the Gaussians, based on the measurements of all views and on labels of the user."""

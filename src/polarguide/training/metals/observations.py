@@ -1,6 +1,6 @@
-"""Measurements of each Gaussian by the views, and its labels in ``materials/``.
+"""Measurements of each Gaussian in the views, and its labels in ``materials/``.
 
-Pixels count by the blending weights of the Gaussian.
+A pixel contributes to the values of a Gaussian in proportion to the blending weight of this Gaussian.
 """
 
 from __future__ import annotations
@@ -25,18 +25,18 @@ from polarguide.training.priors import guide_normals
 from polarguide.training.recipe import MetalViews
 
 LEAST_PIXELS = 0.3
-"""Pixels in all views above which a Gaussian is measured or labeled."""
+"""Least sum of a Gaussian's blending weights over all views for which it is measured or labeled."""
 
 
 class ViewSamples(NamedTuple):
-    """Means over the pixels of each Gaussian in V views.
+    """Means over the pixels of each of N Gaussians, in each of V views.
 
     Attributes:
-        weight: [V, N] sum of the blending weights.
-        s0: [V, N, 3] S0.
-        across: [V, N, 3] polarization P across the plane of incidence.
-        oblique: [V, N, 3] polarization at 45 degrees to that plane.
-        cosine: [V, N] cosine of the zenith angle.
+        weight: [V, N] sum of the blending weights of the pixels.
+        s0: [V, N, 3] mean S0.
+        across: [V, N, 3] mean polarization P across the plane of incidence.
+        oblique: [V, N, 3] mean polarization at 45 degrees to that plane.
+        cosine: [V, N] mean cosine of the zenith angle.
     """
 
     weight: Tensor
@@ -49,9 +49,9 @@ class ViewSamples(NamedTuple):
 def view_sums(
     gaussians: Parameters, views: Iterable[View], rasterize: Rasterize, limits: MetalViews
 ) -> list[Tensor]:
-    """Return sums [N, 11] over the pixels of each view, which ``samples_of`` converts to means.
+    """Return, for each view, sums [N, 11] over the pixels of each Gaussian.
 
-    Every view has to determine the Stokes vector.
+    ``samples_of`` converts these sums to means. Every view has to determine the Stokes vector.
     """
     return [_look(gaussians, view, rasterize, limits.least_normal) for view in views]
 
@@ -62,7 +62,7 @@ def evenly(views: Sequence[View], most: int) -> Sequence[View]:
 
 
 def shares(gaussians: Parameters, camera: Camera, target: Tensor, rasterize: Rasterize) -> Tensor:
-    """Return sums [N, C] over the pixels of a picture [H, W, C], weighted by the blending weights of each Gaussian."""
+    """Return, for each Gaussian, the sum of a picture [H, W, C] weighted by its blending weights, [N, C]."""
     with torch.no_grad():
         fixed = splats(gaussians)
     features = target.new_zeros(len(fixed.means), target.shape[-1], requires_grad=True)
@@ -72,7 +72,11 @@ def shares(gaussians: Parameters, camera: Camera, target: Tensor, rasterize: Ras
 
 
 def _look(gaussians: Parameters, view: View, rasterize: Rasterize, least_normal: float) -> Tensor:
-    """Return sums [N, 11] over the pixels of a view: 1, S0, P, the polarization at 45 degrees, and the cosine."""
+    """Return sums [N, 11] over the pixels of each Gaussian in a view.
+
+    The columns are 1, S0 (three colors), P (three), the polarization at 45 degrees (three), and the cosine of the
+    zenith.
+    """
     device = gaussians["means"].device
     normal = render(gaussians, view.camera, rasterize, RenderRequest(sh_degree=0)).normal
     view = view.to(device)
@@ -94,7 +98,7 @@ def _look(gaussians: Parameters, view: View, rasterize: Rasterize, least_normal:
 
 
 def samples_of(looks: Sequence[Tensor], which: slice, limits: MetalViews) -> ViewSamples:
-    """Return the means of the sums of some Gaussians, with weight 0 for views that do not count."""
+    """Convert sums to means for the selected Gaussians; unusable views get weight 0."""
     sums = torch.stack([look[which] for look in looks])
     weight = sums[..., 0]
     means = sums[..., 1:] / weight.clamp(min=1e-6)[..., None]
@@ -106,12 +110,12 @@ def samples_of(looks: Sequence[Tensor], which: slice, limits: MetalViews) -> Vie
 
 @torch.no_grad()
 def blended(gaussians: Parameters, values: Tensor, camera: Camera, rasterize: Rasterize) -> Tensor:
-    """Return a value of each Gaussian [N] as blended in a view, [H, W]."""
+    """Blend one value per Gaussian [N] to a picture [H, W]."""
     return rasterize(splats(gaussians, values[:, None]), camera).features[..., 0]
 
 
 def metalness_share(gaussians: Parameters, camera: Camera, rasterize: Rasterize) -> Tensor | None:
-    """Return the blended metalness [H, W]; None without metals."""
+    """Return the blended metalness [H, W], or None if no Gaussian is a metal."""
     metalness = gaussians.get("metalness")
     if metalness is None or not any_nonzero(gaussians, "metalness"):
         return None
@@ -126,7 +130,7 @@ def labeled_views(views: Iterable[View]) -> list[tuple[View, Tensor]]:
 def label_weights(
     gaussians: Parameters, views: Iterable[View], rasterize: Rasterize, memory: MemoryBound = UNBOUNDED
 ) -> Tensor:
-    """Return the weight [N, 2] of the pixels that the user labels as dielectric and as metal, over the views."""
+    """Return the weights [N, 2] of the pixels that the user labels as dielectric and as metal, over all views."""
     means = gaussians["means"].detach()
     labels = means.new_zeros(len(means), 2)
     for view, kinds in memory.between(labeled_views(views)):
@@ -153,8 +157,8 @@ def contradicted(
         memory: returns freed memory to the system.
 
     Returns:
-        By the name of the view, the share of its labels that others contradict, relative to those that others label as
-        well. The largest share comes first.
+        The share of contradicted labels by the name of the view, largest share first. It is relative to the labels of
+        Gaussians that other views label as well.
     """
     opposed_shares = {}
     for view, kinds in memory.between(labeled_views(views)):
@@ -169,17 +173,17 @@ def contradicted(
 
 
 def _labels_in(gaussians: Parameters, view: View, kinds: Tensor, rasterize: Rasterize) -> Tensor:
-    """Return the weight [N, 2] of the pixels that the user labels as dielectric and as metal in a view."""
+    """Return the weights [N, 2] of the pixels that the user labels as dielectric and as metal in one view."""
     return _labeled(gaussians, view, kinds, [(kinds == 1) | (kinds > 2), kinds == 2], rasterize)
 
 
 def _labeled(
     gaussians: Parameters, view: View, kinds: Tensor, masks: Sequence[Tensor], rasterize: Rasterize
 ) -> Tensor:
-    """Return the pixels [N, K] of masks [H, W] in a view; 0 for Gaussians with few labeled pixels.
+    """Return the number of pixels of each Gaussian in each of K masks [H, W], as [N, K].
 
-    At least half of the pixels have to be labeled, because pixels at the outline of a label also contain Gaussians
-    behind it and next to it.
+    The number is 0 for Gaussians with less than half of their pixels labeled. The reason is that pixels at the outline
+    of a label also show Gaussians behind it and next to it.
     """
     named = kinds > 0
     target = torch.stack((named, torch.ones_like(named), *masks), dim=-1).float()
@@ -190,7 +194,7 @@ def _labeled(
 
 
 LEAST_SEEN = 0.05
-"""Pixels of a Gaussian in all views above which their refractive indices count."""
+"""Least sum of a Gaussian's blending weights over all views for which it gets the refractive index of a material."""
 
 
 @torch.no_grad()
@@ -204,8 +208,8 @@ def index_offsets(
 ) -> Tensor:
     """Return the offset [N] of each Gaussian from the refractive index of the run.
 
-    The offset belongs to the material of most of its pixels in all views. It is 0 for metals, and for pixels without a
-    material or with one that the table lacks.
+    The offset belongs to the material that most pixels of the Gaussian show in all views. It is 0 for metals, for
+    pixels without a material, and for materials that ``indices`` lacks.
 
     Args:
         gaussians: the Gaussians.
@@ -232,7 +236,7 @@ def index_offsets(
 
 
 def numbers_in(view: View) -> set[int]:
-    """Return the numbers of the labeled dielectrics of a view that may have their own refractive indices."""
+    """Return the material numbers in a view that may have their own refractive index."""
     return set() if view.materials is None else set(view.materials.unique().tolist()) - {0, 1, 2}
 
 
@@ -240,7 +244,7 @@ def numbers_in(view: View) -> set[int]:
 def index_picture(
     gaussians: Parameters, camera: Camera, rasterize: Rasterize, refractive_index: float
 ) -> Tensor | None:
-    """Return the blended refractive indices [H, W]; None if all Gaussians have that of the run."""
+    """Return the blended refractive indices [H, W], or None if all Gaussians have the index of the run."""
     offsets = gaussians.get("index_offset")
     if offsets is None or not any_nonzero(gaussians, "index_offset"):
         return None

@@ -1,27 +1,28 @@
-"""Search for metals in a training: its steps, its decision, and its messages.
+"""Search for metals in a training: its schedule, its decision, and its messages.
 
-The decision is the minimum of one energy over the whole scene, found by a minimum cut. With x = 1 for a metal, E(x) is
-the sum over all Gaussians of ``-u x`` and over all pairs of neighbors of ``likeness w |x_i - x_j|``. The evidence u is
-that of the views minus the prior, in nats, and infinite for Gaussians that the user labels. Each connected piece of
-metal has an additional fixed cost.
+The decision minimizes one energy over the whole scene by a minimum cut. With x = 1 for a metal and 0 for a dielectric,
+E(x) has two sums. One is the sum of ``-u x`` over all Gaussians. The other is the sum of ``likeness w |x_i - x_j|``
+over all pairs of neighbors. The evidence u is the evidence of the views minus the prior, in nats. It is infinite for
+Gaussians that the user labels. Each connected piece of metal has an additional fixed cost.
 
-The evidence is the log likelihood ratio of metal and dielectric for each Gaussian. At a Gaussian, a view measures S0
-and, per color, the polarization P across the rendered normal's plane of incidence and U at 45 degrees to it. ``rho``
-are Fresnel's degrees of polarization.
+The evidence of the views is the log likelihood ratio of metal and dielectric for each Gaussian. At a Gaussian, a view
+measures S0 and two components of polarization for each color. P is the polarization across the plane of incidence of
+the rendered normal, and U is the polarization at 45 degrees to this plane. ``rho`` are Fresnel's degrees of
+polarization.
 
-- The body light d of a dielectric is the same from everywhere, and its specular light s is free: ``S0 = d + s``,
-  ``P = k rho_s s - rho_d d``. Roughness leaves the share k of the polarization, from ``ROUGH`` to 1.
-- A metal mirrors free light and polarizes it according to its reflectance r: ``P = rho(r) S0``. Its color is that of
-  the mirrored light times r, so that r follows the observed color.
+- The diffuse light d of a dielectric is the same in all views, and its specular light s is unknown in each view: ``S0 =
+d + s``, ``P = k rho_s s - rho_d d``. Roughness reduces the specular polarization by a factor k in ``ROUGH``.
+- A metal mirrors unknown light and polarizes it according to its reflectance r: ``P = rho(r) S0``. Its color is the
+color of the mirrored light times r, so r is derived from the observed color.
 
 Unpolarized light has no U. Polarized light changes P about as much as U. A metal preserves at most the share
 ``conductor_oblique_share`` of U (aluminum 0.98 at 45 degrees and 0.91 at 60; copper and gold 0.57 at 60 and 0.1 at 70).
-A dielectric preserves at most ``sqrt(Rs Rp)`` times the light of the scene. Each hypothesis reduces its error
-in P by the part of U that it explains, and the rest of U is an error.
+A dielectric preserves at most ``sqrt(Rs Rp)`` times the light of the scene. Under each hypothesis, the explained part
+of U reduces the error in P, and the rest of U is added as an error.
 
-The errors E are mean squares relative to the light, in n views of unknown variance. With e the typical error of the
-scene, a lower bound of all errors, they give the log likelihood ratio
-``n log((e^2 + E_dielectric) / (e^2 + E_metal))``: n/2 for each of P and U.
+The errors E are mean squares relative to the light, over n views of unknown variance. With e the typical error of the
+scene, a lower bound of all errors, the log likelihood ratio is ``n log((e^2 + E_dielectric) / (e^2 + E_metal))``. P and
+U contribute n/2 each.
 """
 
 from __future__ import annotations
@@ -69,27 +70,27 @@ from polarguide.training.settings import ResolvedSettings
 from polarguide.training.state import TrainingState
 
 ROUGH = (1.0, 0.85, 0.7, 0.55)
-"""Shares of the specular polarization that roughness of a dielectric may leave."""
+"""Tested shares of the specular polarization that remain on a rough dielectric."""
 LEVELS = (0.5, 0.6, 0.7, 0.8, 0.88, 0.95)
-"""Levels of the tested reflectances, which are a level times a power of the observed color."""
+"""Levels of the tested reflectances. A tested reflectance is a level times a power of the observed color."""
 POWERS = (0.5, 0.75, 1.0)
 """Powers of the observed color in the tested reflectances."""
 GOLD = 0.38
-"""Smallest over largest reflectance of the most deeply colored metal, gold."""
+"""Smallest over largest reflectance of gold, the most deeply colored metal."""
 UNKNOWNS = 2
-"""Number of unknowns of either hypothesis, which determine the same number of views."""
+"""Number of unknowns of each hypothesis. As many views are needed to determine the unknowns, and give no evidence."""
 NOISE = 1e-4
-"""Lower bound of the typical error of a scene: mean square of the noise of the views, relative to the light."""
+"""Lower bound of the typical error of a scene, which is the mean square of the noise relative to the light."""
 CHUNK = 1 << 14
 """Batch size in Gaussians, which bounds the memory of intermediate tensors."""
 
 
 class Errors(NamedTuple):
-    """Errors of both hypotheses.
+    """Errors of the two hypotheses, dielectric and metal, for N Gaussians.
 
     Attributes:
-        dielectric, metal: [N] mean squares relative to the light.
-        reflectance: [N, 3] reflectance of the metal.
+        dielectric, metal: [N] mean squared errors relative to the light.
+        reflectance: [N, 3] reflectance of the metal with the smallest error.
     """
 
     dielectric: Tensor
@@ -122,7 +123,7 @@ def errors(samples: ViewSamples, refractive_index: float, light: float, dark: fl
         samples: means over the views.
         refractive_index: refractive index of dielectrics.
         light: mean radiance of the scene, S0.
-        dark: radiance added to the reference of relative errors.
+        dark: radiance that is added to the denominator of relative errors.
     """
     s0 = samples.s0
     across = samples.across
@@ -149,7 +150,7 @@ def errors(samples: ViewSamples, refractive_index: float, light: float, dark: fl
     oblique = mean(samples.oblique**2)
 
     def excused(error: Tensor, largest: Tensor) -> Tensor:
-        """Subtract the part of an error that an oblique polarization up to ``largest`` explains, and add the excess."""
+        """Reduce an error by the part of U, up to ``largest``, that the hypothesis explains; add the excess of U."""
         beyond = mean((samples.oblique.abs() - largest).clamp(min=0) ** 2)
         return (error - (oblique - beyond).clamp(min=0)).clamp(min=0) + beyond
 
@@ -177,9 +178,9 @@ def evidence(
     limits: MetalViews,
     memory: MemoryBound = UNBOUNDED,
 ) -> MetalEvidence:
-    """Return the evidence of the views for each Gaussian; see the module's text.
+    """Compute the evidence of the views for each Gaussian, as the module describes.
 
-    Views whose pictures do not determine the Stokes vector only contribute the labels of the user.
+    Views whose pictures do not determine the Stokes vector contribute only the labels of the user.
     """
     labels = label_weights(gaussians, views, rasterize, memory)
     measured = evenly([view for view in views if view.is_determined], limits.most_views)
@@ -197,7 +198,7 @@ def evidence(
 def of_views(
     looks: Sequence[Tensor], labels: Tensor, refractive_index: float, rules: MetalRules, limits: MetalViews
 ) -> MetalEvidence:
-    """Return the evidence of the sums of ``view_sums`` and of the labels of the user."""
+    """Compute the evidence from the sums of ``view_sums`` and the labels of the user."""
     sums = torch.stack([look.sum(dim=0) for look in looks]).sum(dim=0)
     light = float(sums[1:4].mean() / sums[0].clamp(min=1e-6))
     parts = []
@@ -217,9 +218,9 @@ def of_views(
 
 
 def _tint_cost(color: Tensor, weight: Tensor, rules: MetalRules) -> Tensor:
-    """Return the cost [N] of a metal that is more deeply colored than gold in the mean light of the scene.
+    """Return the cost [N] of metals that are more deeply colored than gold, in nats per view.
 
-    The unit is nats per view.
+    The color is relative to the mean light of the scene.
     """
     mean = (color * weight[:, None]).sum(dim=0) / weight.sum().clamp(min=1e-6)
     tints = (color / mean.clamp(min=1e-6)).clamp(min=1e-3)
@@ -230,7 +231,7 @@ def _tint_cost(color: Tensor, weight: Tensor, rules: MetalRules) -> Tensor:
 NEIGHBORS = 16
 """Number of neighbors of a Gaussian."""
 PER_NAT = 100
-"""Capacity of one nat in the flow, whose capacities are integers."""
+"""Capacity of one nat in the minimum cut, which requires integer capacities."""
 INFINITE = 1e5
 """Evidence of a label, in nats, which exceeds all other evidence."""
 DARK = 0.02
@@ -238,11 +239,11 @@ DARK = 0.02
 
 
 class Graph(NamedTuple):
-    """Pairs of neighbors.
+    """Neighboring Gaussians, as M pairs.
 
     Attributes:
-        first, second: [M] indices of both Gaussians.
-        cost: [M] cost of different materials, in nats.
+        first, second: [M] indices of the two Gaussians of each pair.
+        cost: [M] cost in nats if only one Gaussian of the pair is a metal.
     """
 
     first: NDArray[np.int64]
@@ -251,7 +252,7 @@ class Graph(NamedTuple):
 
 
 def neighbor_graph(gaussians: Parameters, measured: MetalEvidence, rules: MetalRules) -> Graph:
-    """Return the nearest neighbors of each Gaussian, connected by the similarity of their normals and colors.
+    """Connect each Gaussian to its nearest neighbors, with costs by the similarity of normals and colors.
 
     Color differences are relative to the root mean square difference of neighbors in the scene.
     """
@@ -276,7 +277,7 @@ def neighbor_graph(gaussians: Parameters, measured: MetalEvidence, rules: MetalR
 
 
 def unary(measured: MetalEvidence, allowed: Tensor, rules: MetalRules) -> Tensor:
-    """Return the evidence [N] for metal of each Gaussian alone, in nats.
+    """Return the evidence [N] that each Gaussian is a metal, in nats, regardless of its neighbors.
 
     Args:
         measured: evidence of the views.
@@ -290,7 +291,7 @@ def unary(measured: MetalEvidence, allowed: Tensor, rules: MetalRules) -> Tensor
 
 
 def minimum_cut(nats: NDArray[np.float64], graph: Graph) -> NDArray[np.bool_]:
-    """Return the x [N] of least energy; in a tie, the one with the fewest metals."""
+    """Return the mask [N] of metals with the least energy; ties go to the mask with the fewest metals."""
     count = len(nats)
     every = np.arange(count)
     source = np.full(count, count)
@@ -311,7 +312,7 @@ def minimum_cut(nats: NDArray[np.float64], graph: Graph) -> NDArray[np.bool_]:
 def surfaces(
     metal: NDArray[np.bool_], nats: NDArray[np.float64], graph: Graph, least: float
 ) -> NDArray[np.bool_]:
-    """Return the metals in pieces that lower the energy by more than the cost of a piece."""
+    """Return the mask of metals without pieces that lower the energy by less than the cost of a piece."""
     count = len(metal)
     first, second, cost = graph
     inside = metal[first] & metal[second] & (cost > 0.5 / PER_NAT)
@@ -331,15 +332,17 @@ def decide(
     rules: MetalRules,
     priors: Sequence[float] = (1.0,),
 ) -> Tensor:
-    """Return the metalness [N]: the mean of the minimum of the energy over several priors.
+    """Return the metalness [N] of the Gaussians, averaged over decisions with several priors.
+
+    Each decision is the minimum of the energy for one prior.
 
     Args:
         measured: evidence of the views.
         gaussians: the Gaussians.
         allowed: [N] bool, Gaussians that may be metals without a label.
         rules: constants of the energy.
-        priors: shares of the prior. With one share, a Gaussian is a metal (1) or a dielectric (0). With more, metalness
-            is between them where the priors lead to different decisions.
+        priors: factors on the prior. With a single factor, the metalness of a Gaussian is 1 (metal) or 0 (dielectric).
+            With several factors, it is between 0 and 1 where the decisions differ.
     """
     graph = neighbor_graph(gaussians, measured, rules)
     metalness = np.zeros(len(allowed), dtype=np.float32)
@@ -350,7 +353,7 @@ def decide(
 
 
 SOFT_PRIORS = (1 / 3, 2 / 3, 1.0)
-"""Shares of the prior before the last search; metalness is the share of these decisions for metal."""
+"""Factors on the prior in all searches except the last. Metalness is the share of the decisions for metal."""
 
 
 @torch.no_grad()
@@ -363,14 +366,15 @@ def light_gain(
     limits: MetalViews,
     memory: MemoryBound = UNBOUNDED,
 ) -> float:
-    """Return the factor by which the light should be brighter, according to the first metals.
+    """Return the factor by which the learned light should become brighter.
 
-    Dielectrics determine only the product of strength and light. Metals, whose reflectance is known, determine the
-    light.
+    Dielectrics determine only the product of reflection strength and light. Metals have a known reflectance and
+    therefore determine the light itself.
 
     Returns:
-        The median of measured over rendered light of metals, at most ``most_gain`` and at least a value that keeps
-        strengths below 1. 1 without views, and for too few metal pixels.
+        The median of measured over rendered light on the first metals. It is limited to at most ``most_gain``, and to
+        at
+        least a value that keeps strengths below 1. The factor is 1 if there are no views or too few pixels of metal.
     """
     ratios = []
     pixels = 0
@@ -396,7 +400,7 @@ def light_gain(
 
 
 class MetalSearch:
-    """Search for metals at the refreshes of the priors, within the share of the steps that the recipe specifies.
+    """Search for metals, which runs at refreshes of the priors in the share of the steps that the recipe specifies.
 
     Args:
         context: context of the training.
@@ -415,7 +419,7 @@ class MetalSearch:
 
     @torch.no_grad()
     def look(self, state: TrainingState) -> None:
-        """Decide which Gaussians are metals, and initialize new metals with the measurement."""
+        """Decide which Gaussians are metals, and initialize new metals with their measured reflectance."""
         context = self._context
         views = context.views
         if not any(view.is_determined or view.materials is not None for view in views):
@@ -442,7 +446,7 @@ class MetalSearch:
         context.memory.clear()
 
     def _warn_of_contradictions(self, gaussians: Gaussians, labels: Tensor) -> None:
-        """Warn once of files of materials that other views contradict."""
+        """Warn once about views whose labels contradict other views."""
         context = self._context
         limits = context.recipe.metal_views
         rasterize = context.backend.rasterize
@@ -458,9 +462,10 @@ class MetalSearch:
 
     @torch.no_grad()
     def undecided(self, state: TrainingState) -> Tensor | None:
-        """Return a mask [N] of Gaussians that are dielectrics by the prior alone, and metals by their measurement.
+        """Return a mask [N] of Gaussians that are dielectrics only because of the prior.
 
-        None if the training does not search for metals, or if no view determines the Stokes vector.
+        Their measurements alone would make them metals. Return None if the training does not search for metals, or if
+        no view determines the Stokes vector.
         """
         if not self._looks or not any(view.is_determined for view in self._context.views):
             return None
@@ -484,7 +489,7 @@ class MetalSearch:
     def _allowed(self, state: TrainingState) -> Tensor:
         """Return a mask [N] of Gaussians that may be metals without a label.
 
-        It is empty without polarization, because the range of a label is then unknown.
+        Without polarization, no Gaussian is allowed, because the extent of a labeled surface is then unknown.
         """
         context = self._context
         means = state.gaussians["means"].detach()
@@ -493,22 +498,22 @@ class MetalSearch:
         return ~is_far & any(view.is_determined for view in context.views)
 
     def _priors(self, step: int) -> tuple[float, ...]:
-        """Return the shares of the prior at a step: several before the last search, for soft metalness.
+        """Return the factors on the prior at a step: several before the last search, and one in the last search.
 
-        A metal that is shaded as a dielectric has wrong normals and wrong evidence. A likely metal is therefore shaded
-        as a mixture first, and becomes a dielectric again if its new normals do not confirm the metal.
+        A metal that is shaded as a dielectric has wrong normals and thus wrong evidence. A likely metal is therefore
+        first shaded as a mixture. It becomes a dielectric again if its new normals do not confirm that it is a metal.
         """
         return SOFT_PRIORS if step < max(self._looks, default=step) else (1.0,)
 
 
 def refreshes(recipe: Recipe, steps: int) -> list[int]:
-    """Return the steps of a training that refresh its priors."""
+    """Return the steps at which a training refreshes its priors."""
     schedule = Schedule(recipe, steps)
     return [step for step in range(steps) if "refresh_priors" in schedule.at(step).actions]
 
 
 def looks(recipe: Recipe, settings: ResolvedSettings) -> list[int]:
-    """Return the steps at which a training decides on metals; empty if all surfaces are dielectrics."""
+    """Return the steps at which a training searches for metals; empty if all surfaces are dielectrics."""
     if not _searches(recipe, settings):
         return []
     steps = settings.steps
@@ -518,7 +523,8 @@ def looks(recipe: Recipe, settings: ResolvedSettings) -> list[int]:
 def warn_of_unused_materials(context: TrainingContext) -> None:
     """Warn if ``materials/``, or refractive indices of single materials, have no effect on a training.
 
-    Recipes that never refresh their priors, such as controls, do not search for metals and get no warning of these.
+    Recipes that never refresh their priors, such as controls, do not search for metals. They get no warning about
+    labels of metals.
     """
     recipe = context.recipe
     settings = context.settings
