@@ -44,22 +44,23 @@ _OPTION_OF = {"analyzers": "--calibration (of polarguide calibrate)", "align": "
 
 @dataclass(frozen=True)
 class ShotOptions(RawOptions):
-    """Options of reading shots.
+    """Options for reading shots.
 
     Attributes:
         sensor: Sensor of raw mosaics (IMX250, IMX253 or IMX264 with MYR for color, MZR for monochrome), or the model of
             the camera. Without it, files are shots through a filter.
-        bits: Bits of a value in 16-bit files; default: 16 for shots through a filter, for mosaics 12 if no value
-            exceeds 4095, else 16.
-        saturation: Stored value from which the sensor saturates; default: the value at which samples pile up, or full
+        bits: Number of used bits in 16-bit files. Default for shots through a filter: 16. Default for mosaics: 12 if no
+            value exceeds 4095, else 16.
+        saturation: Smallest stored value of a saturated sample. Default: the value that very many samples have, or full
             scale.
         demosaic: full, half or quarter resolution of the sensor.
         align: Estimate and correct small shifts between the four shots of a filter. Sets at other angles are not moved.
-        gains: exif corrects exposures that the files state; auto also corrects gains of the angles that are estimated
-            from the light of each shot; none corrects neither.
-        full_well: Electrons of a sample at full scale, for its noise; default: the noise is estimated from each shot.
-        read_noise: Electrons of noise without light; requires the full well.
-        snr: Smallest DoLP of a pixel with a valid angle, in standard deviations.
+        gains: exif corrects different exposures that the files state. auto also corrects unequal brightness of the
+            angles, which it estimates from each shot. none corrects nothing.
+        full_well: Electrons of a sample at full scale, from which its noise is computed. Default: the noise is
+            estimated from each shot.
+        read_noise: Standard deviation of the noise without light, in electrons. It requires the full well.
+        snr: Smallest ratio of the DoLP to its standard deviation at a pixel with a valid angle.
     """
 
     demosaic: Literal["half", "quarter", "full"] = "full"
@@ -124,9 +125,9 @@ class MeasureOptions:
 
     Attributes:
         roi: Region x,y,width,height in pixels of the maps, or the corners of a polygon, x,y;x,y;x,y (in quotes),
-            optionally with name=... before it; repeat it for several regions. Default: the whole picture.
+            optionally with name=... before it. Repeat the option for several regions. Default: the whole picture.
         limits: JSON file with a bound per field. Shots beyond a limit are drawn, and the exit status is 3.
-        reference: A golden part from the same camera and position, for difference maps and their figures.
+        reference: Shot of a reference part from the same camera and position, with which all shots are compared.
         threshold: DoLP above which pixels count in dolp_share.
         overwrite: Replace a table that was measured with other options.
     """
@@ -143,14 +144,14 @@ class MeasureOptions:
 
 @dataclass(frozen=True)
 class WatchOptions:
-    """Options of a watched folder.
+    """Options for watching a folder.
 
     Attributes:
-        watch: Folder whose shots are measured as they arrive, until Ctrl-C; each once, also after a restart with the
-            same --out.
+        watch: Folder whose shots are measured as they arrive, until Ctrl-C. Each shot is measured once, even after a
+            restart with the same --out.
         settle: Seconds without a change after which a file is read.
         patience: Seconds without a change after which an incomplete file counts as unread.
-        idle: Stop after so many seconds without a new file; 0 waits forever.
+        idle: Seconds without a new file after which the command ends. 0 waits forever.
     """
 
     watch: Path | None = None

@@ -139,14 +139,16 @@ class SynthSettings:
     """Settings of the rendering and of the simulated camera.
 
     Attributes:
-        size: Width and height of the pictures; a simulated polarization sensor has twice as many pixels each way.
-        samples: Paths per pixel and lobe; test views use four times as many.
+        size: Width and height of the pictures. A simulated polarization sensor has twice as many pixels in each
+            direction.
+        samples: Paths per pixel and lobe. Held-out views use four times as many.
         seed: Seed of every random draw.
-        sensor: A sensor whose 12-bit raw mosaics are also written, for polarguide prepare; filter: one 8-bit JPEG of
-            each view, through a filter before an ordinary camera.
-        noise: Photon and read noise; 1 is a sensor exposed to full scale, 2 a quarter of that light, 0 no noise.
+        sensor: Sensor whose 12-bit raw mosaics are also written, for polarguide prepare. filter writes one 8-bit JPEG
+            of each view, through a filter before an ordinary camera.
+        noise: Photon and read noise. 1 simulates an exposure to full scale, 2 an exposure with a quarter of that light,
+            0 no noise.
         color: Three channels with exact values, or a sampled spectrum.
-        ground_truth: Views with ground truth.
+        ground_truth: Views for which ground truth is written.
         points: Approximate number of sparse points.
         test_every: Interval of held-out views.
     """
@@ -198,11 +200,11 @@ class SynthSettings:
 
 @dataclass(frozen=True)
 class Overrides:
-    """Changes to a scene for controlled studies; None keeps the value of the scene.
+    """Changes to a scene for controlled studies. None keeps the value of the scene.
 
     Attributes:
-        views: Number of views; default: the number in the scene.
-        spacing: Degrees between neighboring views on a ring.
+        views: Number of views. Default: the number in the scene.
+        spacing: Angle in degrees between neighboring views on a ring.
         roughness: Roughness of all plastic objects in the foreground.
         index: Refractive index of all plastic objects in the foreground.
     """

@@ -153,7 +153,7 @@ def _rotate_view(capture: Capture, change: Calibration, folder: Path, view: str)
 
 
 def _corrected_metadata(capture: Capture, change: Calibration) -> bytes:
-    """Return the content of ``scene.json`` for the corrected copy: the original content with a note on the correction."""
+    """Return the content of ``scene.json`` for the corrected copy: the original, and a note on the correction."""
     path = capture.root / METADATA
     content: dict[str, Any] = read_record(path, dict[str, Any]) if path.exists() else {}
     note = {

@@ -20,13 +20,14 @@ class InspectSettings:
     """Settings of an inspection.
 
     Attributes:
-        normals: Evidence on the angles. points uses only points that several views observe; train also trains normals
-            without polarization; auto trains if the points do not decide.
+        normals: Evidence on the angles. points uses only points that several views observe. train also trains normals
+            without polarization. auto trains if the points do not decide.
         steps: Optimizer steps of this training. Its state is kept in the folder of the inspection, and resumed.
         refractive_index: Refractive index of the surfaces. By default, that of scene.json, else 1.5.
-        downscale: Side of pixel boxes that are averaged first. 0 averages until pictures are at most 640 pixels wide.
+        downscale: Width of pixel blocks that are averaged first. 0 averages until pictures are at most 640 pixels wide
+            and high.
         transfer: Encoding of radiance in the files.
-        calibration: File of polarguide calibrate. The inspection corrects the scene with it.
+        calibration: File of polarguide calibrate, with which the inspection corrects the scene.
     """
 
     normals: Normals = "auto"

@@ -35,11 +35,11 @@ ORIGINS = ("auto", "dataset", "sfm", "none")
 
 @dataclass(frozen=True)
 class PictureSettings(SampledOptions):
-    """Settings of sources that are developed.
+    """Settings of sources whose pictures are developed from camera files.
 
     Attributes:
         white_balance: none, gray (the mean color becomes gray), or gains of R, G and B such as 1.9,1,1.6.
-        precision: source rounds the intensities to less than a fifth of a step of the camera's values; full keeps 16
+        precision: source rounds the intensities to less than a fifth of a step of the camera's values. full keeps 16
             bits in larger files.
     """
 
@@ -60,7 +60,7 @@ class MosaicSettings(RawMosaicOptions, PictureSettings):
 
 @dataclass(frozen=True)
 class FilterSettings(FilterOptions, PictureSettings):
-    """Settings of views of four shots through a filter."""
+    """Settings of captures that have four shots of each view through a filter."""
 
 
 @dataclass(frozen=True)
@@ -68,10 +68,10 @@ class SinglesSettings(FilterSettings):
     """Settings of photographs through a filter at any angles.
 
     Attributes:
-        angles: Polarizer angles of singles: unknown or none for all, repeating numbers in the order of the files
-            (such as 0,60,120), or the path of a table (.csv). By default, angles.csv, folders or names state them.
-        shots_per_view: Number of consecutive photographs, by name, of one view. --angles has the same number of angles,
-            or a word. By default, groups that show one place are detected.
+        angles: Polarizer angles of singles: unknown or none for all, repeating numbers in the order of the files (such
+            as 0,60,120), or the path of a table (.csv). By default, angles.csv, folders or names state them.
+        shots_per_view: Number of consecutive photographs, by name, that show one view. --angles lists the same number
+            of angles, or is unknown or none. By default, groups that show one place are detected.
     """
 
     angles: str | None = None
@@ -80,7 +80,7 @@ class SinglesSettings(FilterSettings):
 
 @dataclass(frozen=True)
 class EncodedStokesSettings(EncodedOptions, GainOptions):
-    """Settings of Stokes vectors made of encoded pictures."""
+    """Settings of datasets whose Stokes vectors are computed from encoded pictures."""
 
 
 _KINDS: dict[str, type[GainOptions]] = {
@@ -177,7 +177,7 @@ class PrepareSettings(RawOptions, MosaicSettings, SinglesSettings):
         )
 
     def record(self) -> dict[str, Any]:
-        """Return all settings as plain JSON types."""
+        """Return all settings as plain JSON types, for the record of the preparation."""
         plain: dict[str, Any] = json.loads(json.dumps(dataclasses.asdict(self), default=str))
         return plain
 
@@ -200,7 +200,7 @@ class CalibrationOptions:
     zero: float | None = None
 
     def read(self) -> Calibration:
-        """Read the calibration file and apply the other options.
+        """Read the calibration file, and apply the options that take precedence.
 
         Raises:
             PolarguideError: the file or the order is wrong.
@@ -224,7 +224,10 @@ class CalibrationOptions:
         return None if self.order is None else tuple(angle for angle in angles if angle is not None)
 
     def analyzers(self) -> Path | None:
-        """Return the file if polarguide calibrate wrote it, for ``PrepareSettings.analyzers``; else None."""
+        """Return the calibration file if polarguide calibrate wrote it, else None.
+
+        The result is the value of ``PrepareSettings.analyzers``.
+        """
         return (
             self.calibration if self.calibration is not None and is_analyzer_file(self.calibration) else None
         )

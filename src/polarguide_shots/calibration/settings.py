@@ -32,25 +32,26 @@ _IN_DEGREES = re.compile(r"\d ?deg(?![a-z])")
 
 @dataclass(frozen=True)
 class CalibrateSettings(MosaicOptions):
-    """Settings of the shots of a polarizer, and of the calibration.
+    """Settings of a calibration, and of its shots of a polarizer.
 
     Attributes:
         sensor: Sensor of the mosaics (IMX250, IMX253 or IMX264 with MYR for color, MZR for monochrome), or the model of
             the camera.
-        lens: Name of the lens, for the file; the calibration includes its polarization.
-        angles: Angles of the polarizer in degrees, in the order of the files' names, such as 0,15,30; names if the
-            files' names end in them, after _ or a space. Default: the angles are estimated.
-        sense: Direction in which given angles count, as the picture is displayed.
-        reference: Zero of the angles. angles is the zero of the given angles; mean is the zero at which the sensor's
-            positions have no mean deviation from their names. Default: angles if given, else mean.
-        polarizer_extinction: Extinction ratio of the polarizer; default: an ideal polarizer.
+        lens: Name of the lens, which is stored in the file. The calibration includes the polarization by the lens.
+        angles: Angles of the polarizer in degrees, in the order of the files' names, such as 0,15,30. Use names if the
+            files' names end in the angles, after _ or a space. Default: the angles are estimated.
+        sense: Direction in which given angles increase, as the picture is displayed.
+        reference: Zero of the angles. angles is the zero of the given angles. mean is the zero at which the sensor's
+            positions have no mean deviation from their nominal angles. Default: angles if given, else mean.
+        polarizer_extinction: Extinction ratio of the polarizer. Default: an ideal polarizer.
         flat: Picture of the same light without the polarizer, or a folder of such pictures. The light must be
             unpolarized.
-        dark_frame: Picture with the lens covered, or a folder of such pictures, subtracted in place of the black level.
-        saturation: Stored value from which the sensor saturates; default: full scale.
-        bits: Bits of a sensor value in 16-bit files; default: 12 if no value exceeds 4095, else 16.
-        block: Side in pixels of the blocks that share analyzer vectors; 1 for separate vectors. Default: blocks of 32,
-            or single pixels if these differ by more than their noise.
+        dark_frame: Picture with the lens covered, or a folder of such pictures. It is subtracted in place of the black
+            level.
+        saturation: Smallest stored value of a saturated sample. Default: full scale.
+        bits: Number of used bits in 16-bit files. Default: 12 if no value exceeds 4095, else 16.
+        block: Width in pixels of the blocks that share analyzer vectors. 1 gives each pixel its own vector. Default:
+            blocks of 32, or single pixels if their differences exceed the noise.
     """
 
     sensor: SensorName = field()
