@@ -210,7 +210,7 @@ PAIRINGS: tuple[FileOrder, ...] = ((0, 45, 90, 135), (0, 90, 45, 135), (0, 45, 1
 ``capture.checks.Measures.residuals`` has the same order.
 """
 SENSES = (1, -1)
-"""Senses of the two rows of a profile in ``OrderEvidence``: counter-clockwise and clockwise."""
+"""Senses of the two rows of a profile in ``OrderEvidence``. 1 is counter-clockwise, -1 is clockwise."""
 
 
 def decide_pairing(residuals: NDArray[np.float64]) -> int | None:

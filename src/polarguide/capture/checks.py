@@ -68,9 +68,13 @@ class CheckLimits:
 # Curvature (see ``pair_slopes``) of encoded data taken as linear is about -0.6, of linear data decoded as sRGB about
 # +0.3; the gain differences of real sensors leave less than 0.1.
 ENCODED = (-0.12, -0.25)
-"""Two limits for files that are not linear: they may be encoded below the first curvature, and are below the second."""
+"""Two limits of the curvature of files that are read as linear.
+
+Below the first limit, the files may be encoded. Below the second limit, they are encoded."""
 DECODED = (0.1, 0.2)
-"""Two limits for files that were decoded twice: they may be above the first curvature, and are above the second."""
+"""Two limits of the curvature of files that are decoded as sRGB.
+
+Above the first limit, the files may already be linear. Above the second limit, they are linear."""
 BENT = 0.05
 """Largest significant curvature of a linear response. A gamma of 0.9 has a curvature of -0.056, and a similar error of
 DoLP."""

@@ -111,7 +111,7 @@ class Exposure:
 
 
 FOUR = tuple(Exposure(float(angle)) for angle in ANGLES)
-"""Exposures of a polarization camera: 0, 45, 90 and 135 degrees with gain 1."""
+"""Exposures of a polarization camera at 0, 45, 90 and 135 degrees with gain 1."""
 PLAIN = (Exposure(filtered=False),)
 """Exposures of a view with one photograph without a polarizer."""
 

@@ -366,11 +366,11 @@ GIBIBYTE = 1 << 30
 SHARE = 0.8
 """Share of the free memory that pictures may take by default."""
 MASKS = 2 + 4
-"""Number of bytes per pixel that a view without its pictures takes: peak, black, invalid, saturated and mask."""
+"""Number of bytes per pixel of a view without its pictures, for peak, black, invalid, saturated and mask."""
 KEPT = 4 * 3 * 2 + MASKS
 """Number of bytes per pixel that a view with four pictures of three channels takes."""
 READ = 4 * 3 * 2 * 3
-"""Number of bytes per pixel that reading a view takes: decoded pictures, their linear codes, and single channels."""
+"""Number of bytes per pixel for reading a view, with decoded pictures, their linear codes, and single channels."""
 
 
 def check_memory(

@@ -1,7 +1,7 @@
 """Presentation of a capture: color, up axis, scale, crop box and credits.
 
-``presentation.json`` next to a scene or a run stores them for display and export. Pictures, training and scores do not
-use them. Fields of a run take precedence over those of its scene.
+They are stored in the file ``presentation.json`` of a scene or a run, and are used for display and export only. They
+have no effect on training and scores. Fields of a run take precedence over fields of its scene.
 
 Names follow USD (``metersPerUnit``, ``upAxis``) and the asset metadata of glTF.
 """
@@ -30,14 +30,14 @@ PRESENTATION_FILE = "presentation.json"
 REMEDY = "Correct it with polarguide present, or remove the file."
 CREDITS = ("title", "author", "license", "provenance")
 LENGTHS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "km": 1e3, "in": 0.0254, "ft": 0.3048}
-"""Meters per unit of length."""
+"""Length of each unit in meters."""
 LEAST_METERS = 1e-9
-"""Smallest length of a unit: a nanometer. Exported files have single precision, which limits both ends."""
+"""Smallest length of a scene's unit in meters. The single precision of exported files limits the length."""
 MOST_METERS = 1e9
-"""Largest length of a unit: eighty Earths."""
+"""Largest length of a scene's unit in meters."""
 WIDEST_CROP = 100.0
 STOPS = 8.0
-"""Largest exposure in stops in both directions: the number of bits of a displayed picture."""
+"""Largest change of the exposure in stops, brighter or darker."""
 
 Vector = tuple[float, float, float]
 Gain = Annotated[float, Meta(ge=0.02, le=50)]
@@ -46,12 +46,16 @@ Text = Annotated[str, Meta(max_length=1000)]
 
 
 class Crop(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
-    """Box around the point that the cameras look at, along their common right, up and back.
+    """Box that limits the displayed and exported part of a scene.
+
+    Its origin is the point at which the cameras look. Its axes are the common right, up and back directions of the
+    cameras. The unit of length is the distance of the cameras from the origin.
 
     Attributes:
-        low, high: corners relative to the cameras' distance from that point; low is less than high.
-        up: up axis when the box was made, in the scene's axes [3]; default: that of the cameras. The box does not move
-            when another up axis is chosen.
+        low: corner with the smallest coordinates, [3].
+        high: corner with the largest coordinates, [3].
+        up: up direction when the box was created, in the axes of the scene, [3]; default: that of the cameras. A later
+            change of the up direction does not move the box.
     """
 
     low: Vector
@@ -73,14 +77,18 @@ class Crop(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_default
         return around if self.up is None else _upright(around, self.up)
 
     def corners(self, around: SceneFrame) -> Tensor:
-        """Return the eight corners in the world, [8, 3] float64, last axis fastest, from the frame of the cameras."""
+        """Return the eight corners of the box in the world, [8, 3] float64. The last axis changes fastest.
+
+        Args:
+            around: frame of the cameras.
+        """
         frame = self._frame(around)
         sides = torch.tensor([self.low, self.high], dtype=torch.float64)
         local = torch.cartesian_prod(*sides.T) * frame.distance
         return frame.center + local @ frame.panorama_axes().T
 
     def inside(self, means: Tensor, around: SceneFrame) -> Tensor:
-        """Return a mask [N] of the points [N, 3] in the box; ``around`` is the frame of the cameras."""
+        """Return a mask [N] of the points [N, 3] that are inside the box. ``around`` is the frame of the cameras."""
         frame = self._frame(around)
         axes, center = (t.to(means) for t in (frame.panorama_axes(), frame.center))
         local = (means - center) @ axes / frame.distance
@@ -91,13 +99,15 @@ class Crop(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_default
 
 
 class Chart(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Color correction by a color chart in a photograph, for the light of the capture.
+    """Color correction that was measured from a color chart in a photograph of the capture.
 
     Attributes:
-        matrix: from the camera's linear RGB (S0 / 2) to linear sRGB (D65), with white balance and exposure, [3][3].
-        delta_e, delta_e_worst: mean and largest CIEDE2000 of the patches in leave-one-out validation.
-        patches: number of patches.
-        view: name of the photograph.
+        matrix: matrix from the camera's linear RGB (S0 / 2) to linear sRGB (D65), [3][3]. It includes white balance and
+            exposure.
+        delta_e: mean color difference CIEDE2000 of the patches in leave-one-out validation.
+        delta_e_worst: largest color difference CIEDE2000 of the patches in leave-one-out validation.
+        patches: number of patches of the chart.
+        view: name of the photograph with the chart.
     """
 
     matrix: tuple[tuple[Factor, Factor, Factor], tuple[Factor, Factor, Factor], tuple[Factor, Factor, Factor]]
@@ -128,13 +138,13 @@ class Presentation(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit
     """Content of ``presentation.json``. All fields are optional.
 
     Attributes:
-        white_balance: factors on linear R, G and B for display, 0.02 to 50; data do not change.
-        chart: color chart, as alternative to a white balance.
-        exposure: stops by which the display is brighter, -8 to 8.
-        up_axis: up direction in the scene's axes, of any length, [3]; default: that of the cameras.
-        meters_per_unit: length of a unit of the scene.
-        crop: box of the displayed and exported part of the scene.
-        whole: if True, the whole scene is displayed, as alternative to a crop box.
+        white_balance: factors by which linear R, G and B are multiplied for display, 0.02 to 50.
+        chart: correction by a color chart, which is an alternative to a white balance.
+        exposure: change of the displayed brightness in stops, -8 to 8.
+        up_axis: up direction in the axes of the scene, a vector of any length, [3]; default: that of the cameras.
+        meters_per_unit: length of the scene's unit in meters.
+        crop: box that limits the displayed and exported part of the scene.
+        whole: if True, the whole scene is displayed and a crop box of the scene is ignored.
         title: title of the capture.
         author: author of the capture.
         license: name of a license, such as CC-BY-4.0.
@@ -171,12 +181,12 @@ class Presentation(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit
 
     @property
     def credit(self) -> str:
-        """Author and license in one line; may be empty."""
+        """Author and license in one line. It may be empty."""
         return ", ".join(text for text in (self.author, self.license) if text)
 
     @property
     def color(self) -> Tensor | None:
-        """Matrix from the camera's linear RGB to displayed linear sRGB, [3, 3] float32; None: as photographed.
+        """Matrix from the camera's linear RGB to displayed linear sRGB, [3, 3] float32, or None without a correction.
 
         The matrix applies to radiance, because light adds up. Stokes vectors, DoLP and AoLP are ratios within a channel
         of the camera and do not change.
@@ -189,7 +199,10 @@ class Presentation(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit
         return matrix * 2.0 ** (self.exposure or 0.0)
 
     def over(self, other: Presentation) -> Presentation:
-        """Return the fields of this presentation, with those of another as default; see ``EITHER``."""
+        """Return this presentation, in which missing fields are filled with the fields of another presentation.
+
+        A field is not filled if it excludes a field of this presentation, see ``EITHER``.
+        """
         own = _specified_fields(self)
         default = _specified_fields(other)
         for names in EITHER:
@@ -198,21 +211,21 @@ class Presentation(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit
         return Presentation(**{**default, **own})
 
     def upright(self, around: SceneFrame) -> SceneFrame:
-        """Return a frame of cameras with the specified up axis."""
+        """Return the frame of the cameras, rotated to the up direction of this presentation."""
         return around if self.up_axis is None else _upright(around, self.up_axis)
 
     def to_record(self) -> dict[str, Any]:
-        """Return the content of the file without missing fields."""
+        """Return the fields that have a value, as the content of ``presentation.json``."""
         record: dict[str, Any] = msgspec.to_builtins(self)
         return record
 
 
 EITHER = (("white_balance", "chart"), ("crop", "whole"))
-"""Pairs of fields of which only one may be specified."""
+"""Pairs of fields that exclude each other."""
 
 
 def _specified_fields(presentation: Presentation) -> Mapping[str, Any]:
-    """Return the fields with a value."""
+    """Return the fields that have a value by name."""
     fields = {name: getattr(presentation, name) for name in presentation.__struct_fields__}
     return {name: value for name, value in fields.items() if value not in (None, "", False)}
 
@@ -230,7 +243,7 @@ def _check_direction(name: str, vector: Vector | None) -> None:
 
 
 def read_presentation(folder: Path) -> Presentation:
-    """Read the presentation of a scene or a run; an empty one if there is no file.
+    """Read the presentation of a scene or a run. If the file does not exist, return an empty presentation.
 
     Raises:
         PolarguideError: the file is invalid.
@@ -251,7 +264,7 @@ def write_presentation(folder: Path, presentation: Presentation) -> Path:
 
 
 def parse_length(text: str) -> float:
-    """Parse a length such as ``85mm``, ``8.5 cm``, ``0.085`` and return it in meters.
+    """Parse a length such as ``85mm``, ``8.5 cm`` or ``0.085``, and return it in meters.
 
     Raises:
         PolarguideError: the text is not a length.
@@ -281,19 +294,23 @@ def shown_length(units: float, meters_per_unit: float | None) -> str:
 
 
 def colored(radiance: Tensor, color: Tensor | None) -> Tensor:
-    """Convert linear radiance [..., 3] to displayed colors by ``Presentation.color``, clamped at 0."""
+    """Convert linear radiance [..., 3] to displayed linear sRGB with the matrix ``Presentation.color``.
+
+    Negative results are set to 0.
+    """
     return radiance if color is None else (radiance @ color.T.to(radiance)).clamp(min=0)
 
 
 def in_camera(radiance: Tensor, color: Tensor | None) -> Tensor:
-    """Convert displayed linear sRGB to radiance of the camera's channels: the inverse of ``colored``."""
+    """Convert displayed linear sRGB to radiance in the channels of the camera. This is the inverse of ``colored``."""
     return radiance if color is None else colored(radiance, torch.linalg.inv(color))
 
 
 def colored_reflectance(reflectance: Tensor, color: Tensor | None) -> Tensor:
-    """Convert reflectance [..., 3] of the camera's channels to linear sRGB: ``M (r * M^-1 1)``.
+    """Convert reflectance r [..., 3] in the channels of the camera to linear sRGB, ``M (r * M^-1 1)``.
 
-    It is the color of the surface in light that is displayed as white. White balance and exposure do not change it.
+    The result is the color of the surface under light that is displayed as white. It does not depend on white balance
+    and exposure.
     """
     if color is None:
         return reflectance

@@ -58,7 +58,7 @@ from polarguide.geometry.camera import Camera
 from polarguide.optics import Mount
 
 TEST_EVERY = 8
-"""Number of views for which one view is held out: one view in eight."""
+"""Number of views for each held-out view. One view in eight is held out."""
 FAR = 2.5
 """Largest distance of a held-out view from its nearest training view, relative to the usual distance of neighbors.
 

@@ -1,4 +1,4 @@
-"""Variants of a scene: with a masked background, with fewer pictures per view, or with smaller pictures."""
+"""Create variants of a scene: with a black background, with fewer pictures per view, or with smaller pictures."""
 
 from __future__ import annotations
 
@@ -25,21 +25,21 @@ from polarguide.geometry.camera import seen_at
 from polarguide.geometry.polarizer import ANGLES
 
 BLACK = 0.005
-"""Linear S0/2 of black pixels: a little over one step of 8 bits, because of noise and rounding."""
+"""Linear ``S0 / 2`` below which a pixel counts as black. It is slightly more than one step of 8-bit values."""
 BLACK_EDGE = 0.95
-"""Share of black pixels at the edge of a picture with a black background."""
+"""Smallest share of black pixels at the edge of a picture with a black background."""
 BLACK_VIEWS = 0.9
-"""Share of the views that must have a black edge."""
+"""Smallest share of views with a black edge in a scene with a black background."""
 GROWN = 3
-"""Dilation of a subject in pixels before the rest counts as empty, because edges are blended."""
+"""Number of pixels by which a subject is dilated before the other pixels count as empty. Its edges are blended."""
 INSIDE = 0.8
-"""Share of the pictures with a point in their field of view that must have it in the mask."""
+"""Smallest share of the pictures showing a point in which a point of the subject is inside the mask."""
 
 
 def black_pixels(view: View) -> Tensor:
-    """Return a mask of the black pixels of a photograph, [H, W] bool on the CPU.
+    """Return a mask of the black pixels of a view, [H, W] bool on the CPU.
 
-    The mean over color channels and 3 x 3 pixels is compared, which suppresses noise.
+    To suppress noise, the mean over the color channels and 3 x 3 pixels is compared with ``BLACK``.
     """
     picture = view.photograph().cpu().mean(dim=-1).numpy()
     return torch.from_numpy(np.asarray(cv2.blur(picture, (3, 3)) <= BLACK))
@@ -51,10 +51,11 @@ def has_black_background(views: Sequence[View]) -> bool:
 
 
 def empty_pixels(view: View) -> Tensor:
-    """Return a mask of the empty pixels around a subject in front of black, [H, W] bool.
+    """Return a mask of the pixels that show the black background around a subject, [H, W] bool.
 
-    These are the pixels outside the view's mask. Without a mask, they are the black regions at the edge of the picture,
-    so that a dark spot of the subject is no hole. The subject is dilated by ``GROWN`` pixels.
+    They are the pixels outside the mask of the view. If the view has no mask, they are the black regions that touch the
+    edge of the picture. A dark spot inside the subject is therefore not included. The subject is dilated by ``GROWN``
+    pixels.
     """
     if view.mask is not None:
         subject = view.mask.cpu().numpy()
@@ -66,7 +67,7 @@ def empty_pixels(view: View) -> Tensor:
 
 
 def mask_background(scene: Scene) -> Scene:
-    """Return the scene with black pixels outside the masks, and with the points of the subject only.
+    """Return a scene whose pixels outside the masks are black, and which has the points inside the masks only.
 
     Raises:
         PolarguideError: a view has no mask, or no point is in the masks.
@@ -96,7 +97,7 @@ def mask_background(scene: Scene) -> Scene:
 
 
 def _in_masks(points: Tensor, views: Sequence[View]) -> Tensor:
-    """Return a mask [M] of the points [M, 3] in the dilated masks of most pictures that see them."""
+    """Return a mask [M] of the points [M, 3] that are inside the dilated masks of most pictures that show them."""
     counts = torch.zeros(len(points))
     inside = torch.zeros(len(points))
     for view in views:
@@ -113,7 +114,7 @@ def _black(view: View) -> NDArray[np.bool_]:
 
 
 def _black_edge(view: View) -> bool:
-    """Return True if the edge of a picture is black, but not the whole picture."""
+    """Return True if the edge of a picture is black and the whole picture is not."""
     black = _black(view)
     edge = np.concatenate([black[0], black[-1], black[1:-1, 0], black[1:-1, -1]])
     return bool(edge.mean() >= BLACK_EDGE) and not bool(black.all())
@@ -125,26 +126,38 @@ def _grown(mask: NDArray[np.bool_], pixels: int) -> NDArray[np.bool_]:
 
 
 THREE = (0.0, 60.0, 120.0)
-"""Angles of ``three`` in degrees."""
+"""Polarizer angles in degrees of the choice ``three`` of ``select_exposures``."""
 EVERY = 4
-"""Period of the views with four pictures in ``mixed`` and ``sparse``."""
+"""Distance between views with four pictures for the choices ``mixed`` and ``sparse`` of ``select_exposures``."""
 
 Change = Callable[[View, int], View | None]
-"""Function of a training view and its index that returns the view with other pictures, or None to remove it."""
+"""Function that changes the pictures of a training view. Its arguments are the view and the view's index.
+
+It returns the changed view, or None to remove the view.
+"""
 
 
 def select_exposures(scene: Scene, exposures: Exposures) -> Scene:
-    """Return the scene with other pictures of its training views. Held-out views do not change.
+    """Return a scene whose training views have fewer pictures or other angles. Held-out views do not change.
+
+    The choices are:
+
+    - ``captured``: all pictures, for any scene.
+    - ``four``: all four pictures.
+    - ``three``: pictures at 0, 60 and 120 degrees, computed from the Stokes vectors.
+    - ``two``: two pictures at a right angle, alternately at 0 and 90 degrees and at 45 and 135 degrees.
+    - ``one``: one picture. The angle changes from view to view: 0, 45, 90, 135 degrees, and again.
+    - ``unknown``: one picture as for ``one``, but its angle is not known.
+    - ``mixed``: all four pictures of every fourth view, and ``S0 / 2`` of the other views.
+    - ``sparse``: all four pictures of every fourth view. The other views are removed.
+    - ``none``: the picture without a polarizer, ``S0 / 2``.
 
     Args:
-        scene: scene with pictures at 0, 45, 90 and 135 degrees of every training view.
-        exposures: ``captured``: no change. ``four``: all four pictures. ``three``: at 0, 60 and 120 degrees, computed
-            from the Stokes vectors. ``two``: a pair at right angles, 0 and 90 or 45 and 135 in turn. ``one``: one
-            picture, at 0, 45, 90, 135 in turn. ``unknown``: the same with unknown angles. ``mixed``: all four of every
-            fourth view, S0/2 of the others. ``sparse``: only every fourth view. ``none``: S0/2.
+        scene: scene whose training views have pictures at 0, 45, 90 and 135 degrees.
+        exposures: name of a choice.
 
     Raises:
-        PolarguideError: the choice is invalid, or the scene has other pictures.
+        PolarguideError: the choice is invalid, or a training view has pictures at other angles.
     """
     check_choice("exposures", exposures, EXPOSURES)
     if exposures == "captured":
@@ -209,16 +222,16 @@ _CHANGES: dict[str, Change] = {
 
 
 def smaller_view(view: View, factor: int, latest: Latest) -> View:
-    """Return a view averaged over boxes of pixels, like ``load_scene(downscale=factor)``. Codes are computed on demand.
+    """Return a smaller view, which is averaged over boxes of pixels like in ``load_scene(downscale=factor)``.
 
-    Linear codes are averaged, and so are Stokes vectors, but not angles. A pixel is invalid or saturated if any pixel
-    of its box is. It belongs to the mask or to a material if all are. Incomplete boxes at the right and bottom are
-    dropped. The view has no ground truth.
+    Linear codes are averaged when they are read. A pixel of the result is invalid or saturated if any pixel of its box
+    is. It belongs to the mask or to a material if all pixels of its box do. Incomplete boxes at the right and bottom
+    are left out. The view has no ground truth.
 
     Args:
         view: the view at full size.
         factor: side of the boxes in pixels.
-        latest: cache of the codes of views in memory.
+        latest: cache that smaller views share. It keeps the codes of one view.
     """
     full = view.pictures
 
@@ -241,7 +254,7 @@ def smaller_view(view: View, factor: int, latest: Latest) -> View:
 
 
 class SmallerViews(Sequence[View]):
-    """Lazy sequence of views averaged over boxes of pixels."""
+    """Sequence of smaller views, each of which is computed when it is used."""
 
     def __init__(self, views: Sequence[View], factor: int) -> None:
         self._views = views
@@ -263,9 +276,9 @@ class SmallerViews(Sequence[View]):
 
 
 def smaller(scene: Scene, longest: int) -> Scene:
-    """Return the training views of a scene, averaged until no side is longer than ``longest`` pixels.
+    """Return the training views of a scene, averaged so that no side is longer than ``longest`` pixels.
 
-    The result has no masks, ground truth or held-out views. A scene with small pictures is returned as it is.
+    The result has no masks, no ground truth and no held-out views. A scene with small pictures is returned unchanged.
     """
     views = scene.train_views
     size = max(max(view.camera.width, view.camera.height) for view in views)

@@ -22,7 +22,7 @@ _FILTERS = (cv2.IMWRITE_PNG_FILTER_SUB, cv2.IMWRITE_PNG_FILTER_NONE)
 _SAMPLE_ROWS = 64
 _LEVEL = 6
 Rounding = Sequence[tuple[int, int]]
-"""Rounding of codes by ranges: the first code of each range, and the step to whose multiples its codes are rounded."""
+"""Rounding of codes. A pair has the first code of a range, and the step to whose multiples its codes are rounded."""
 EXACT: Rounding = ((0, 1),)
 
 

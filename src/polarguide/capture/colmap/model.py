@@ -247,9 +247,9 @@ def _checked_count(count: int, most: int) -> int:
 
 _NUMBER = re.compile(rb"[-+]?(?:(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?|nan|inf)", re.IGNORECASE)
 _POSE = 9
-"""Number of values before the name in a line of ``images.txt``: id, quaternion, translation and camera."""
+"""Number of values before the name in a line of ``images.txt``. They are id, quaternion, translation and camera."""
 _PLACE = 3
-"""Number of values of an observation in ``images.txt``: x, y and the id of a point."""
+"""Number of values of an observation in ``images.txt``. They are x, y and the id of a point."""
 
 
 def read_text_images(data: bytes) -> tuple[bytes, dict[int, str]]:

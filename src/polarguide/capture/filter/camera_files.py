@@ -1,4 +1,4 @@
-"""Files of cameras: developed camera raw, and metadata of exposures (EXIF).
+"""Read files of ordinary cameras: camera raw files, and the exposure data in EXIF tags.
 
 LibRaw (package rawpy) develops camera raw to linear pictures. All steps that depend on the picture are disabled:
 automatic brightness, white level and white balance, gamma, and color matrix. The other steps are equal for every shot:
@@ -38,7 +38,7 @@ from polarguide.core.files import read_file
 from polarguide.core.text import listed
 
 CAMERA_RAW = (".dng", ".nef", ".nrw", ".cr2", ".cr3", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw")
-"""Suffixes of camera raw files."""
+"""Suffixes of camera raw files in lower case."""
 _FULL = 65535
 _EXIF_OF_FLIP = {0: 1, 3: 3, 5: 8, 6: 6}
 
@@ -55,12 +55,13 @@ def read_camera_raw(
 
     Args:
         path: the file.
-        gains: gains of R, G and B. They are divided by the smallest one, so full scale of the sensor is full scale of
+        gains: gains of R, G and B. They are divided by the smallest gain, so a saturated sensor gives the full scale of
             the picture.
-        opener: replacement of ``rawpy.imread``, called with the file's content; None for rawpy.
+        opener: function that opens the content of a file instead of ``rawpy.imread``, or None.
 
     Returns:
-        Linear RGB [H, W, 3] in the camera's own colors, as stored; and the EXIF orientation, 1 to 8.
+        The linear picture [H, W, 3] in the camera's own RGB colors, not rotated for display; and the EXIF orientation,
+        1 to 8.
 
     Raises:
         PolarguideError: rawpy is missing, or the file cannot be read or is damaged.
@@ -91,7 +92,10 @@ def read_camera_raw(
 
 
 def stored_frame(path: Path) -> tuple[tuple[int, int], int]:
-    """Return width and height of the stored pixels of a camera raw file, and its EXIF orientation, without development.
+    """Return the size and the EXIF orientation of a camera raw file without developing it.
+
+    Returns:
+        The width and height of the stored pixels; and the orientation.
 
     Raises:
         PolarguideError: rawpy is missing, or the file cannot be read.
@@ -102,7 +106,7 @@ def stored_frame(path: Path) -> tuple[tuple[int, int], int]:
 
 @contextlib.contextmanager
 def _opened(path: Path, opener: Callable[[io.BytesIO], Any] | None = None) -> Iterator[Any]:
-    """Open a camera raw file with rawpy; any error inside the context is a fault of the file.
+    """Open a camera raw file with rawpy as a context. Any error inside the context is reported as a fault of the file.
 
     Raises:
         PolarguideError: rawpy is missing, or the file cannot be read or developed.
@@ -122,14 +126,14 @@ def _opened(path: Path, opener: Callable[[io.BytesIO], Any] | None = None) -> It
 
 
 def _message(error: Exception) -> str:
-    """Return LibRaw's error message, which may be bytes, as one line."""
+    """Return the message of an error of LibRaw as one line of text."""
     reason = error.args[0] if error.args else ""
     text = reason.decode(errors="replace") if isinstance(reason, bytes) else str(reason)
     return (text.strip().splitlines() or [type(error).__name__])[0]
 
 
 def libraw_parameters(gains: tuple[float, float, float]) -> dict[str, Any]:
-    """Return LibRaw's settings by the names of ``rawpy.Params``."""
+    """Return the settings for LibRaw. The keys are the names of the arguments of ``rawpy.Params``."""
     red, green, blue = (gain / min(gains) for gain in gains)
     settings: dict[str, Any] = {
         "gamma": (1.0, 1.0),
@@ -157,9 +161,9 @@ def libraw_parameters(gains: tuple[float, float, float]) -> dict[str, Any]:
 
 _MIRRORED = (2, 4, 5, 7)
 QUARTER_TURNS = (5, 6, 7, 8)
-"""Orientations that exchange width and height."""
+"""EXIF orientations that exchange width and height."""
 INVERSE = {code: {6: 8, 8: 6}.get(code, code) for code in range(1, 9)}
-"""Inverse of each orientation."""
+"""EXIF orientation that undoes each orientation."""
 TURNS = {
     2: "mirrored left to right",
     3: "turned by 180 degrees",
@@ -169,13 +173,13 @@ TURNS = {
     7: "mirrored along the rising diagonal",
     8: "turned by 90 degrees counter-clockwise",
 }
-"""Change of the stored picture for display by each orientation but 1."""
+"""Description of the change from the stored to the displayed picture, for each EXIF orientation except 1."""
 
 
 def orientation(data: bytes) -> int:
-    """Return the orientation tag of a picture file, 1 to 8; 1 (as stored) without a valid tag.
+    """Return the EXIF orientation of a picture file, 1 to 8. Without a valid tag it is 1, which means no rotation.
 
-    HEIC states its rotation in the header; its tag is informative only.
+    The rotation of a HEIC file is read from its header, because its tag is informative only.
     """
     if picture_kind(data) == "HEIF":
         head = heif_head(data)
@@ -185,7 +189,7 @@ def orientation(data: bytes) -> int:
 
 
 def apply_orientation(pixels: NDArray[Any], code: int) -> NDArray[Any]:
-    """Rotate or mirror pixels [H, W, ...] for display by an orientation tag."""
+    """Rotate or mirror pixels [H, W, ...] for display according to an EXIF orientation."""
     if code in (5, 7):
         pixels = pixels.swapaxes(0, 1)
         return np.rot90(pixels, 2) if code == 7 else pixels
@@ -195,14 +199,17 @@ def apply_orientation(pixels: NDArray[Any], code: int) -> NDArray[Any]:
 
 
 def orientation_calibration(code: int) -> Calibration:
-    """Return the change of polarizer angles when the stored picture is rotated or mirrored for display."""
+    """Return the sense and zero of polarizer angles that result from rotating or mirroring a picture for display."""
     return Calibration(
         sense="cw" if code in _MIRRORED else "ccw", zero=90.0 if code in QUARTER_TURNS else 0.0
     )
 
 
 def tags_of(data: bytes) -> dict[int, Any]:
-    """Return the EXIF tags of a picture file or a TIFF-like camera raw file; empty if they are damaged."""
+    """Return the EXIF tags of a picture file or of a camera raw file based on TIFF.
+
+    The result is empty if the tags are missing or damaged.
+    """
     exif = Image.Exif()
     try:
         with warnings.catch_warnings():
@@ -214,7 +221,7 @@ def tags_of(data: bytes) -> dict[int, Any]:
 
 
 def _block_of_tags(data: bytes) -> bytes:
-    """Return the EXIF block of a picture file, which has the format of TIFF; empty without EXIF."""
+    """Return the EXIF block of a picture file. It has the format of TIFF, and is empty if the file has no EXIF tags."""
     block = data
     kind = picture_kind(data)
     if kind in ("JPEG", "WebP"):
@@ -228,40 +235,49 @@ def _block_of_tags(data: bytes) -> bytes:
 
 
 _ISO_TOO_LARGE = 65535
-"""Value of the tag ISO for values of more than 16 bits."""
+"""Value of the tag ISO that means a larger value, which does not fit into 16 bits."""
 _LARGER_ISO = (Base.RecommendedExposureIndex, Base.StandardOutputSensitivity, Base.ISOSpeed)
-"""Tags with larger ISO values: recommended exposure index, standard output sensitivity, ISO speed (EXIF 2.3)."""
+"""Tags of EXIF 2.3 that state the ISO value if it does not fit into the tag ISO."""
 
 _FOCAL_AGREES = 0.01
-"""Relative tolerance of equal focal lengths: tags are rounded, and focus changes the focal length."""
+"""Largest relative difference of focal lengths that count as equal. Tags are rounded, and focusing changes the value.
+"""
 
 
 @dataclass(frozen=True)
 class Lens:
-    """Camera and lens of a picture, as far as its file states them.
+    """Camera and lens that the file of a picture states.
+
+    Pictures with the same lens can share intrinsics.
 
     Attributes:
         camera: text that identifies the camera.
-        focal: focal length, in a unit that pictures of one ``camera`` share; None if unknown.
+        focal: focal length, or None if it is unknown. Its unit is the same for all pictures of a ``camera``.
     """
 
     camera: str
     focal: float | None = None
 
     def agrees(self, other: Lens) -> bool:
-        """Return True if the camera is equal and the focal length at most slightly larger, or unknown."""
+        """Return True if the cameras are equal and this focal length is at most slightly larger than the other.
+
+        If one of the focal lengths is unknown, only the cameras are compared.
+        """
         close = not self.focal or not other.focal or self.focal < (1 + _FOCAL_AGREES) * other.focal
         return self.camera == other.camera and close
 
 
 @dataclass(frozen=True)
 class ExposureData:
-    """Exposure of a photograph, as its file states it; None for missing and implausible values.
+    """Exposure data of a photograph that its file states.
 
     Attributes:
-        camera: maker and model; empty if missing.
-        lens: body and lens, with the focal length in mm of the 35 mm film, else the actual one.
-        seconds, iso, f_number: exposure time, sensitivity and aperture.
+        camera: maker and model of the camera. It is empty if the file does not state them.
+        lens: camera and lens. The focal length is that for 35 mm film if the file states it, otherwise the actual one,
+            in mm.
+        seconds: exposure time in seconds; None if it is missing or implausible.
+        iso: sensitivity; None if it is missing or implausible.
+        f_number: aperture; None if it is missing or implausible.
     """
 
     camera: str = ""
@@ -272,9 +288,10 @@ class ExposureData:
 
     @property
     def light(self) -> float | None:
-        """Exposure, seconds * ISO / f-number^2; None without a time.
+        """Exposure ``seconds * iso / f_number^2``, or None if the exposure time is unknown.
 
-        Missing ISO and f-number count as 100 and 1, so values are comparable among files with the same tags.
+        A missing ISO value is replaced by 100, and a missing f-number by 1. Exposures are therefore comparable only
+        between files with the same tags.
         """
         return (
             None if self.seconds is None else self.seconds * (self.iso or 100.0) / (self.f_number or 1.0) ** 2
@@ -285,7 +302,10 @@ _NAMES = {"seconds": "ExposureTime", "iso": "ISO", "f_number": "FNumber"}
 
 
 def missing_tags(exposures: Mapping[Path, ExposureData]) -> str:
-    """Return a warning if some files lack a tag of the exposure that others have; "" if exposures are comparable."""
+    """Return a warning if some files lack an exposure tag that other files have.
+
+    Return "" if all files have the same tags.
+    """
     for field, name in _NAMES.items():
         without = [path.name for path, data in exposures.items() if getattr(data, field) is None]
         if 0 < len(without) < len(exposures):
@@ -297,10 +317,12 @@ def missing_tags(exposures: Mapping[Path, ExposureData]) -> str:
 
 
 def read_exposure_data(path: Path) -> ExposureData:
-    """Read the exposure data of a file: EXIF of pictures and TIFF-like camera raw; else LibRaw.
+    """Read the exposure data of a picture file or a camera raw file.
+
+    EXIF tags are read if possible. For other camera raw files, LibRaw (package rawpy) reads the data.
 
     Raises:
-        PolarguideError: the file cannot be read, or LibRaw is needed and missing.
+        PolarguideError: the file cannot be read, or rawpy is required and not installed.
     """
     raw = is_camera_raw(path)
     data = read_file(path) if raw else read_picture(path)
@@ -316,7 +338,7 @@ def read_exposure_data(path: Path) -> ExposureData:
 
 
 def exif_data(data: bytes) -> ExposureData:
-    """Return the exposure data in the EXIF tags of a picture file; damaged tags count as missing."""
+    """Return the exposure data in the EXIF tags of a picture file. A damaged tag is treated as missing."""
     tags = tags_of(data)
     camera = _joined_texts(tags, Base.Make, Base.Model)
     exposure = (Base.ExposureTime, Base.ISOSpeedRatings, Base.FNumber)
@@ -327,10 +349,11 @@ def exif_data(data: bytes) -> ExposureData:
 
 
 def _lens(camera: str, tags: dict[int, Any]) -> Lens:
-    """Return the lens by EXIF tags.
+    """Determine the camera and lens from EXIF tags.
 
-    A stated focal length distinguishes lenses. Otherwise, serial number and name of the lens do. Pictures with digital
-    zoom have another camera, because only some makers include it in the focal length.
+    Lenses are distinguished by their focal length. If it is unknown, they are distinguished by serial number and name.
+    Pictures with digital zoom count as pictures of another camera, because only some makers include the zoom in the
+    focal length.
     """
     zoom = number_of(tags.get(Base.DigitalZoomRatio))
     if zoom is not None and zoom > 0 and zoom != 1:  # 0 means no zoom
@@ -348,7 +371,9 @@ def _joined_texts(tags: dict[int, Any], *names: int) -> str:
 
 
 def camera_groups(paths: Mapping[str, Path]) -> dict[str, Lens]:
-    """Return the lens of each view by its first file; agreeing focal lengths share a value. Empty for a single lens.
+    """Return the lens of each view according to its first file. Return an empty result if all views have one lens.
+
+    Focal lengths that agree get the same value.
 
     Raises:
         PolarguideError: a file cannot be read.
@@ -377,7 +402,10 @@ def _plausible(
 
 
 def number_of(value: Any) -> float | None:
-    """Return a tag as a number, the first of several; None if it is missing or not finite."""
+    """Return the value of a tag as a number. If the tag has several values, return the first one.
+
+    Return None if the tag is missing or its value is not finite.
+    """
     try:
         number = float(value[0] if isinstance(value, tuple) else value)
     except (TypeError, ValueError, IndexError, ZeroDivisionError):

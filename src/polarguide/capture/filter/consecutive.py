@@ -152,7 +152,7 @@ def _sharpness(picture: NDArray[np.uint8]) -> float:
 
 
 _MANY = 100
-"""Largest number of pictures whose pairs are all compared, even if their names are numbered: 4950 pairs."""
+"""Largest number of pictures whose pairs are all compared, even if their names are numbered. They form 4950 pairs."""
 _NUMBERED = re.compile(r"(?P<name>.*?)(?P<number>\d+)")
 _NEIGHBORS = 20
 """Approximate number of pictures that COLMAP compares with each picture in sequential matching."""

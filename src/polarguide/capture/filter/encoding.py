@@ -1,4 +1,7 @@
-"""Encoding of the pictures of a capture: measured by the light, stated by the files, or usual for their format."""
+"""Decide whether the pictures of a capture are linear or sRGB.
+
+The encoding is measured from the light, or read from the files, or assumed according to the format of the files.
+"""
 
 from __future__ import annotations
 
@@ -34,14 +37,14 @@ from polarguide.capture.formats.pictures import is_lossy, linear_codes, read_pic
 from polarguide.core.errors import PolarguideError, optional_import
 
 SRGB_EXPONENT = 2.22
-"""Exponent of sRGB at half scale."""
+"""Exponent of the power function that approximates sRGB at half of full scale."""
 _CHARACTERISTICS = {
     **dict.fromkeys((1, 6, 7, 13, 14, 15), SRGB_EXPONENT),
     4: 2.2,
     5: 2.8,
     8: 1.0,
 }
-"""Exponents of transfer characteristics (ITU-T H.273). Television's are displayed like sRGB."""
+"""Exponent of each transfer characteristic of ITU-T H.273. Those for television are treated like sRGB."""
 _UNSPECIFIED = 2
 
 _CURVES = (b"rTRC", b"kTRC")
@@ -54,9 +57,9 @@ class Encoding:
     """Encoding that a picture file states.
 
     Attributes:
-        exponent: exponent at half scale, light = value ^ exponent: 1 for linear files, 2.2 for sRGB and Adobe RGB, 1.8
-            for ProPhoto RGB; None for other curves.
-        source: field of the file with this statement.
+        exponent: exponent of ``light = value ^ exponent`` at half of full scale. It is 1 for linear files, 2.2 for sRGB
+            and Adobe RGB, 1.8 for ProPhoto RGB, and None for a curve that is no power function.
+        source: field of the file that states the encoding.
     """
 
     exponent: float | None
@@ -64,10 +67,11 @@ class Encoding:
 
 
 def stated_encoding(data: bytes) -> Encoding | None:
-    """Return the encoding that a picture file states; None without a readable statement.
+    """Return the encoding that a picture file states. Return None if the file states no readable encoding.
 
-    The order of precedence follows the standard of PNG, with specific statements first: transfer characteristics (cICP
-    of PNG, nclx of HEIC), ICC profile, sRGB and gAMA of PNG or TransferFunction of TIFF, gamma and color space of EXIF.
+    If a file has several statements, the first in this order applies, as in the standard of PNG: transfer
+    characteristics (cICP of PNG, nclx of HEIC); ICC profile; sRGB and gAMA of PNG, or TransferFunction of TIFF; gamma
+    and color space of EXIF.
     """
     characteristics = None
     profile = None
@@ -108,7 +112,7 @@ def stated_encoding(data: bytes) -> Encoding | None:
 
 
 def _of_tiff(data: bytes) -> tuple[bytes | None, Encoding | None]:
-    """Return the ICC profile of a TIFF file, and the encoding by its transfer function."""
+    """Return the ICC profile of a TIFF file, and the encoding that its transfer function states, or None for each."""
     with tifffile.TiffFile(io.BytesIO(data)) as file:
         tags = file.pages.first.tags
         profile = tags.valueof(int(Base.InterColorProfile))
@@ -122,7 +126,7 @@ def _of_tiff(data: bytes) -> tuple[bytes | None, Encoding | None]:
 
 
 def profile_exponent(profile: bytes) -> float | None:
-    """Return the exponent of an ICC profile as in ``Encoding``; None for other curves and damaged profiles."""
+    """Return the exponent of an ICC profile, see ``Encoding``. Return None for other curves and damaged profiles."""
     try:
         decoded = _decoded_middle(profile)
     except (struct.error, OverflowError, ValueError, IndexError):
@@ -133,7 +137,10 @@ def profile_exponent(profile: bytes) -> float | None:
 
 
 def _decoded_middle(profile: bytes) -> float | None:
-    """Return the value of a profile's red or gray curve at half scale (ICC.1, curveType, parametricCurveType)."""
+    """Return the value at half of full scale of the red or gray curve in an ICC profile.
+
+    The standard ICC.1 describes the curves as curveType and parametricCurveType.
+    """
     (count,) = struct.unpack_from(">I", profile, 128)
     entries = [struct.unpack_from(">4sII", profile, 132 + 12 * number) for number in range(min(count, 100))]
     at = next((at for name, at, _ in entries if name in _CURVES), None)
@@ -163,18 +170,18 @@ LOSSY = "JPEG, WebP or HEIC"
 PLAIN = "PNG, TIFF or BMP"
 CAMERA_RAW = "camera raw"
 VIDEO = "video"
-"""Kind of frames of a video: sRGB unless the file states another encoding."""
+"""Name of the kind of pictures that are frames of a video. They are sRGB unless the file states another encoding."""
 ARRAY = "array"
-"""Kind of arrays: linear."""
+"""Name of the kind of pictures that are arrays. They are linear."""
 
 
 def kind_of_file(path: Path) -> str:
-    """Return the kind of a photograph by its suffix."""
+    """Return the kind of a photograph according to its suffix. Each kind has a usual encoding."""
     return CAMERA_RAW if is_camera_raw(path) else LOSSY if is_lossy(path) else PLAIN
 
 
 Stated = tuple[str, str]
-"""An encoding, linear or srgb, and the field that states it."""
+"""Tuple of an encoding, linear or srgb, and the field of the file that states it."""
 _NEAR = 0.1
 """Largest relative deviation of an exponent from those of linear files and sRGB. It is also the relative error of
 DoLP."""
@@ -201,10 +208,11 @@ def transfer_of(path: Path, encoding: Encoding) -> Stated:
 
 
 def stated_transfer(paths: Sequence[Path]) -> Stated | None:
-    """Return the encoding that pictures of one kind state; None if no picture states one.
+    """Return the encoding that pictures of one kind state. Return None if no picture states an encoding.
 
     Raises:
-        PolarguideError: a picture states another encoding than linear or sRGB, or pictures differ.
+        PolarguideError: a picture states an encoding that is neither linear nor sRGB, or pictures state different
+            encodings.
     """
     first: dict[str, tuple[Path, str]] = {}
     without: Path | None = None
@@ -249,21 +257,25 @@ _VIDEO_EXPONENTS = {
     "bt470m": 2.2,
     "bt470bg": 2.8,
 }
-"""Exponents of transfers by ffmpeg's names. Television's are displayed like sRGB."""
+"""Exponent of each transfer function by the name that ffmpeg uses. Those for television are treated like sRGB."""
 _HIGH_RANGE = {"smpte2084": "PQ", "arib-std-b67": "HLG"}
 _COLORS = re.compile(r"[\w-]+/[\w-]+/([\w-]+)")
-"""Matrix, primaries and transfer in ffmpeg's description, such as yuv420p(tv, bt2020nc/bt2020/arib-std-b67)."""
+"""Pattern that finds the transfer function in ffmpeg's description of a video.
+
+An example is yuv420p(tv, bt2020nc/bt2020/arib-std-b67), with matrix, primaries and transfer function.
+"""
 
 
 def stated_video_transfer(path: Path) -> Stated | None:
-    """Return the encoding that a video states, by ffmpeg's name; None without a statement.
+    """Return the encoding that a video file states according to ffmpeg. Return None if the file states no encoding.
 
     Raises:
         PolarguideError: the encoding is not linear or similar to sRGB.
     """
     decoder = optional_import("imageio_ffmpeg", str(path))
     logging.getLogger("imageio_ffmpeg").setLevel(logging.ERROR)  # it warns about sizes of rotated films
-    # Logarithmic films cannot be converted. The option relabels the frames, but not the description of the file.
+    # Films with a logarithmic encoding cannot be converted. The option changes the label of the frames, and does not
+    # change the description of the file.
     frames = decoder.read_frames(str(path), output_params=["-vf", "setparams=color_trc=bt709"])
     try:
         described = str(next(frames).get("pix_fmt", ""))
@@ -285,7 +297,7 @@ def stated_video_transfer(path: Path) -> Stated | None:
 
 @dataclass(frozen=True)
 class TransferDecision:
-    """Decision on a transfer function, with a note on its reason and a warning, or ""."""
+    """Decision on a transfer function, a note for the user about its reason, and a warning, which may be empty."""
 
     transfer: str
     note: str
@@ -293,17 +305,25 @@ class TransferDecision:
 
 
 Slope = Callable[[str], checks.Curvature | None]
-"""Function from a transfer function to the curvature of the response; None if the light does not determine it."""
+"""Function that measures the curvature of the response if the files are decoded with a transfer function.
+
+It returns None if the light does not determine the curvature.
+"""
 
 
 def decide_transfer(
     kind: str, stated: Stated | None, *, eight: bool, slope: Slope | None
 ) -> TransferDecision:
-    """Decide the encoding of pictures: by the light, else by their statement, else by their kind.
+    """Decide the encoding of pictures.
+
+    If the measured curvature of the response decides, it is used. Otherwise the encoding that the files state is used,
+    and otherwise the usual encoding of their kind.
 
     Args:
-        kind: kind of the pictures. stated: stated encoding. eight: True for 8 bits per channel.
-        slope: curvature of views at several angles; None if every view is one picture.
+        kind: kind of the pictures, see ``kind_of_file``.
+        stated: encoding that the files state, or None.
+        eight: True for pictures with 8 bits per channel.
+        slope: function that measures the curvature; None if every view has only one picture.
     """
     measured = None if slope is None else slope("linear")
     encoding = checks.encoding(measured)
@@ -344,12 +364,13 @@ def decide_transfer(
 
 
 def slope_of_shots(shots: Sequence[Shots], angles: Sequence[Sequence[Angle]]) -> Slope:
-    """Return the curvature of the response over some views as a function of the transfer function.
+    """Return a function that measures the curvature of the response for a transfer function, from several views.
 
     Exposures of the pictures may differ.
 
     Args:
-        shots: shots of each view without large shifts, as from a tripod. angles: angles of each view's pictures.
+        shots: shots of each view. Large shifts between shots disturb the measurement.
+        angles: angles of the pictures of each view.
     """
     pairs = [checks.right_pairs(view) for view in angles]
     samples = [checks.sampled(view.pictures) for view in shots]
@@ -370,16 +391,16 @@ def transfer_of_pictures(
     *,
     video: Path | None = None,
 ) -> TransferDecision:
-    """Decide the transfer function of the pictures of a capture or of one set.
+    """Decide the transfer function of the pictures of a capture or of one view.
 
     Args:
-        paths: their files; empty for pictures in memory. transfer: specified transfer function, or auto.
-        judged: function that reads the shots of some views and the angles of each; either all views have several
-            pictures, or one has.
-        video: the file of a video, if the pictures are its frames.
+        paths: files of the pictures; empty for pictures in memory.
+        transfer: transfer function that the user specified, or auto.
+        judged: function that reads the shots of some views. It returns the shots, and the angles of each view.
+        video: file of the video if the pictures are its frames, otherwise None.
 
     Raises:
-        PolarguideError: the files state an unsupported encoding, or several.
+        PolarguideError: the files state an unsupported encoding, or different encodings.
     """
     kind = VIDEO if video else kind_of_file(paths[0]) if paths else ARRAY
     if kind == CAMERA_RAW:
@@ -398,7 +419,10 @@ def transfer_of_pictures(
 
 
 def _doubt(slope: Slope | None, transfer: str) -> str:
-    """Return a warning if the transfer function leaves a significant curvature, like a tone curve; else ""."""
+    """Return a warning if the response is curved significantly after decoding. Otherwise return "".
+
+    A possible cause is a tone curve that the camera applied.
+    """
     curvature = None if slope is None else slope(transfer)
     if curvature is None or not (curvature.surely_below(-checks.BENT) or curvature.surely_above(checks.BENT)):
         return ""

@@ -1,4 +1,4 @@
-"""Discovery and reading of photographs through a filter: four shots of a view, or single shots at any angles."""
+"""Find and read photographs through a filter: four shots of a view, or single shots at any angles."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ from polarguide.core.text import canonical, listed, stem_of
 
 SHOT_SUFFIXES = (*SUFFIXES, *CAMERA_RAW)
 Candidates = dict[str, dict[int, list[Path]]]
-"""Possible files of each shot by view and angle. Ambiguous names give several files."""
+"""Files of each shot by view and angle. There are several files of a shot if names are ambiguous."""
 _SUFFIX = re.compile(
     r"(?P<view>.+?)[-_ .]+(?:i|pol|angle)?[-_ ]?(?<![_ .]-)(?P<angle>0{1,3}|0?45|0?90|135)(?:deg)?",
     re.IGNORECASE,
@@ -57,13 +57,13 @@ _READ = 4 * 3 * (2 + 2)
 
 @dataclass(frozen=True, eq=False)
 class Shots:
-    """Stored shots of a view: four, or K at other angles.
+    """Stored pixels of the K shots of a view.
 
     Attributes:
         pictures: stored values [K, H, W, 3], uint8 or uint16, in the order of the angles.
-        orientation: EXIF orientation.
-        clipped: pixels with a channel of a shot at full scale, [K, H, W].
-        dark: pixels that are 0 in all shots and channels, [H, W].
+        orientation: EXIF orientation of the shots.
+        clipped: mask of the pixels of each shot that are at full scale in some channel, [K, H, W].
+        dark: mask of the pixels that are 0 in all shots and channels, [H, W].
     """
 
     pictures: NDArray[Any]
@@ -73,18 +73,19 @@ class Shots:
 
 
 def find_shots(root: Path, *, nested: bool = False) -> dict[str, dict[int, Path]]:
-    """Return the file of each view and angle: by four folders named like the angles, or by four suffixes.
+    """Find the four shots of each view, and return their files by view and angle.
 
-    Folders are ``0``, ``45``, ``90``, ``135``, also ``000``, ``I-00``, ``pol_45``, ... Suffixes are the same after
-    ``_``, ``-``, a point or a blank: ``cup_0.jpg``, ``cup-I45.jpg``. Files named like the angles alone (``I0.png``,
-    ``I45.png``, ...) are one view, named like the folder, if the folder has no other files.
+    Each angle has a folder, or the names of the files end with the angle. Folders have names such as ``0``, ``45``,
+    ``90`` and ``135``, or ``000``, ``I-00``, ``pol_45``. In names of files, the angle follows after ``_``, ``-``, a
+    point or a blank: ``cup_0.jpg``, ``cup-I45.jpg``. If all files of a folder are named by an angle only (``I0.png``,
+    ``I45.png``, ...), they are one view with the name of the folder.
 
     Args:
         root: the folder.
-        nested: read the subfolders of a folder without pictures, such as one for each view or day.
+        nested: if True, the subfolders of a folder without pictures are searched, for example one for each day.
 
     Returns:
-        An empty dictionary without such names. Angles may be missing; ``require_four_shots`` checks.
+        The files. The result is empty if no name has an angle. Angles may be missing, see ``require_four_shots``.
 
     Raises:
         PolarguideError: two files have the same view and angle, or a folder is missing.
@@ -98,10 +99,13 @@ def find_shots(root: Path, *, nested: bool = False) -> dict[str, dict[int, Path]
 
 
 def list_shots(root: Path, *, nested: bool = False) -> tuple[Candidates, list[Path]]:
-    """Return the shots of ``find_shots`` with all files of each view and angle, and the other pictures.
+    """Find the shots of each view like ``find_shots``, without an error for ambiguous names.
+
+    Returns:
+        All files of each view and angle; and the pictures whose names have no angle.
 
     Raises:
-        PolarguideError: a folder of an angle is missing, or there are two.
+        PolarguideError: the folder of an angle is missing, or an angle has two folders.
     """
     folders = angle_folders(root)
     if not folders:
@@ -121,10 +125,10 @@ def list_shots(root: Path, *, nested: bool = False) -> tuple[Candidates, list[Pa
 
 
 def _refuse_other_formats(folders: Iterable[Path]) -> None:
-    """Refuse folders of angles that contain only files of other formats.
+    """Refuse folders of angles whose files all have unsupported formats.
 
     Raises:
-        PolarguideError: a folder contains files.
+        PolarguideError: a folder contains such files.
     """
     for folder in folders:
         files = [
@@ -141,9 +145,12 @@ def _refuse_other_formats(folders: Iterable[Path]) -> None:
 
 
 def group_files(files: Sequence[Path]) -> tuple[Candidates, list[Path]]:
-    """Return files by view and angle according to their names, and the files without an angle in their name.
+    """Group files by the view and angle in their names.
 
-    Files named like the angles alone are one view, named like their folder, if the folder has no other files.
+    If all files of a folder are named by an angle only, they are one view with the name of the folder.
+
+    Returns:
+        The files by view and angle; and the files whose names have no angle.
     """
     shots: Candidates = {}
     others: list[Path] = []
@@ -161,7 +168,7 @@ def group_files(files: Sequence[Path]) -> tuple[Candidates, list[Path]]:
 
 
 def ambiguity(view: str, files: Mapping[int, Sequence[Path]]) -> PolarguideError | None:
-    """Return the error for two files of one shot of a view; None without such files."""
+    """Return the error for a view with two files of the same shot. Return None if each shot has one file."""
     for angle, (first, *more) in files.items():
         if more:
             return ambiguous(first.parent, f"one picture of {view} at {angle} degrees", first, more[0])
@@ -169,7 +176,7 @@ def ambiguity(view: str, files: Mapping[int, Sequence[Path]]) -> PolarguideError
 
 
 def require_four_shots(root: Path, shots: dict[str, dict[int, Path]]) -> None:
-    """Require four shots of every view.
+    """Check that every view has four shots.
 
     Raises:
         PolarguideError: a shot is missing.
@@ -198,11 +205,13 @@ def read_stack(
     gains: tuple[float, float, float] = (1.0, 1.0, 1.0),
     levels: Levels | None = None,
 ) -> Shots:
-    """Read the shots of a view, any number.
+    """Read the shots of a view. There may be any number of shots.
 
     Args:
-        paths: the files. gains: gains of R, G and B, for camera raw files.
-        levels: levels of the stored values; None for those of the files. Full scale becomes that of the files.
+        paths: files of the shots.
+        gains: gains of R, G and B for camera raw files.
+        levels: levels of the stored values. The values are rescaled so that full scale is the largest value of their
+            type. By default, the files already have this full scale.
 
     Raises:
         PolarguideError: a file cannot be read, or files differ in size, depth or orientation.
@@ -223,11 +232,13 @@ def read_stack(
 def stacked(
     stack: NDArray[Any], orientation: int = 1, *, lossy: bool = False, levels: Levels | None = None
 ) -> Shots:
-    """Return the shots of a view from their stored values [K, H, W, 3].
+    """Create the shots of a view from their stored values.
 
     Args:
-        stack: stored values. orientation: EXIF orientation.
-        lossy: True for files with lossy compression. levels: as in ``read_stack``.
+        stack: stored values, [K, H, W, 3].
+        orientation: EXIF orientation.
+        lossy: True if the files have a lossy compression.
+        levels: levels of the stored values, see ``read_stack``.
     """
     full = int(np.iinfo(stack.dtype).max)
     limit = round(_LOSSY_FULL * full) if lossy else full
@@ -240,7 +251,7 @@ def stacked(
 
 
 def _read_shot(path: Path, gains: tuple[float, float, float]) -> tuple[NDArray[Any], int]:
-    """Return stored values [H, W, 3] of a shot and its EXIF orientation."""
+    """Read a shot, and return its stored values [H, W, 3] and its EXIF orientation."""
     if is_camera_raw(path):
         return read_camera_raw(path, gains)
     data = read_picture(path)
@@ -249,13 +260,13 @@ def _read_shot(path: Path, gains: tuple[float, float, float]) -> tuple[NDArray[A
 
 @dataclass(frozen=True)
 class SingleShot:
-    """A photograph through a filter, or without one.
+    """Photograph through a filter at any angle, or without a filter.
 
     Attributes:
-        path: the file.
-        view: its view; photographs of one view share their pose.
-        angle: stated angle of the filter.
-        gain: stated exposure relative to the others, or None.
+        path: file of the photograph.
+        view: name of the view. All photographs of a view have the same pose.
+        angle: angle of the filter that the user stated.
+        gain: exposure relative to the other photographs that the user stated, or None.
     """
 
     path: Path
@@ -267,17 +278,22 @@ class SingleShot:
 def find_single_shots(
     root: Path, angles: str | None = None, each: int = 1
 ) -> tuple[list[SingleShot], list[Path]]:
-    """Return the photographs of a folder, sorted by view, and the tables that were read.
+    """Find the photographs of a folder with their views and angles.
 
-    Angles come from the option, else from ``angles.csv`` in the folder, else from the subfolders (``0``, ``30``,
-    ``unknown``, ``none``, ...), else from the names of the files (``cup_045.jpg``, ``cup_a30.jpg``). Files whose names
-    differ only in the angle, and lines of a table with one view, are one view.
+    The angles are taken from the first of these sources that exists: the argument ``angles``; the table ``angles.csv``
+    in the folder; the names of the subfolders (``0``, ``30``, ``unknown``, ``none``, ...); the names of the files
+    (``cup_045.jpg``, ``cup_a30.jpg``). Files whose names differ only in the angle belong to one view. A table may state
+    the view of each file.
 
     Args:
         root: the folder.
-        angles: "unknown" or "none" for all, repeating angles in the order of the names such as 0,60,120, or the path of
-            a table.
-        each: number of consecutive photographs of a view, which is named like the first. It requires ``angles``.
+        angles: "unknown" or "none" for all photographs; repeating angles in the order of the names, such as 0,60,120;
+            or the path of a table.
+        each: number of consecutive photographs of each view. The view has the name of its first photograph. It requires
+            ``angles``.
+
+    Returns:
+        The photographs, sorted by view; and the tables that were read.
 
     Raises:
         PolarguideError: a photograph has no angle or two, a file of the table does not exist, two photographs are one
@@ -317,9 +333,10 @@ def find_single_shots(
 
 
 def views_of_names(folder: Path, files: Sequence[Path]) -> list[tuple[str, Angle] | None]:
-    """Return the view and the angle that the names of files in a folder state; None for a name without them.
+    """Return the view and the angle in the name of each file of a folder.
 
-    Files named like angles alone are one view, named like the folder, if all of them have such names.
+    The result is None for a name without an angle. If all files are named by an angle only, they are one view with the
+    name of the folder.
     """
     names = angles_of_names([stem_of(path) for path in files])
     alone = all(name is not None and not name[0] for name in names)
@@ -328,7 +345,13 @@ def views_of_names(folder: Path, files: Sequence[Path]) -> list[tuple[str, Angle
 
 
 def _with_angles(root: Path, angles: str, each: int) -> list[SingleShot]:
-    """Return photographs with the angles of an option: one word for all, or repeating numbers; ``each`` per view."""
+    """Find the photographs of a folder, and assign the angles that the user specified.
+
+    Args:
+        root: the folder.
+        angles: one word for all photographs, or repeating angles in the order of the names.
+        each: number of consecutive photographs of each view, or None.
+    """
     repeating = [parse_angle(part) for part in angles.split(",")]
     if any(angle is None for angle in repeating):
         raise PolarguideError(
@@ -355,10 +378,14 @@ def _with_angles(root: Path, angles: str, each: int) -> list[SingleShot]:
 
 
 def listed_pictures(root: Path, table: Path) -> tuple[list[tuple[Line, Path]], list[Path]]:
-    """Return the lines of a table with the picture of each, and the pictures of the folder without a line.
+    """Match the lines of a table with the pictures of a folder.
+
+    Returns:
+        Each line with the path of its picture; and the pictures that the table does not list.
 
     Raises:
-        PolarguideError: the table cannot be read, or names files outside of the folder or of other formats.
+        PolarguideError: the table cannot be read, or lists a file that is outside the folder or has an unsupported
+            format.
     """
     lines = read_table(table)
     rows = list(zip(lines, files_of(root, table, lines), strict=True))
@@ -406,10 +433,10 @@ def _by_table(root: Path, table: Path) -> list[SingleShot]:
 
 
 def _validated(root: Path, shots: list[SingleShot]) -> list[SingleShot]:
-    """Return the photographs, sorted by view and angle.
+    """Validate photographs, and return them sorted by view and angle.
 
     Raises:
-        PolarguideError: a view name is not a file name, or two photographs of a view have one angle.
+        PolarguideError: the name of a view is no valid file name, or two photographs of a view have the same angle.
     """
     first: dict[tuple[str, object], Path] = {}
     for shot in shots:
@@ -435,5 +462,5 @@ def _validated(root: Path, shots: list[SingleShot]) -> list[SingleShot]:
 
 
 def angle_order(angle: Angle) -> tuple[bool, float]:
-    """Return the sort key of an angle: numbers first, then words."""
+    """Return the key by which angles are sorted. Words follow after all numbers."""
     return (True, 0.0) if isinstance(angle, str) else (False, angle)

@@ -478,7 +478,7 @@ def decode_tiff(data: bytes) -> NDArray[Any]:
 _LARGEST = 281
 _SIDES = [256, 257]
 _PLAIN_TYPES = (3, 4)
-"""Types of the tags for width and height that all decoders support: unsigned integers of 16 and 32 bits."""
+"""Types of the tags for width and height that all decoders support, which are unsigned integers of 16 and 32 bits."""
 _LONG8 = 16
 
 

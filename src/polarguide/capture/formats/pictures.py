@@ -653,7 +653,7 @@ def _require_memory(path: Path, size: tuple[int, int] | None) -> None:
 
 HEAD = 1 << 20
 LARGEST_PIXEL = 32
-"""Largest size of a pixel in a file in bytes: four channels of 64 bits without compression."""
+"""Largest number of bytes per pixel in a file. Four channels of 64 bits take as many without compression."""
 ROOM = 1 << 26
 """Largest size of a picture file's metadata in bytes, such as previews and profiles."""
 
