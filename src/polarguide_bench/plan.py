@@ -392,7 +392,7 @@ def trained_steps(run: Path) -> int | None:
 
 
 def compared_steps(*specified: int | None) -> int:
-    """Return the first number of steps that is not None, or ``STEPS`` if all are None.
+    """Return the first specified number of steps, or ``STEPS`` if no number is specified.
 
     In a comparison, the number does not depend on the size of the pictures, so that scenes are comparable.
     """

@@ -181,7 +181,7 @@ def textured_model(
 def _presented(
     baked: Baked, light: NDArray[np.float32] | None, color: Tensor | None, index: float, reporter: Reporter
 ) -> tuple[NDArray[np.float32], Baked]:
-    """Apply the color of the presentation, and divide radiance by ``light``, the irradiance [M, 3], unless it is None.
+    """Apply the color of the presentation, and divide radiance by the irradiance ``light`` [M, 3] if it is specified.
 
     The color of the presentation is applied to radiance and irradiance before the division.
 
