@@ -162,7 +162,9 @@ def run_batch(
     Raises:
         PolarguideError: there are no captures, a recipe is unknown, or another batch is writing to ``out``.
     """
-    require(captures, "batch", expected="a capture", found="no capture", remedy="Name at least one.")
+    require(
+        captures, "batch", expected="a capture", found="no capture", remedy="Specify at least one capture."
+    )
     for capture in captures:
         recipe_named(capture.recipe)
     root = Path(out)

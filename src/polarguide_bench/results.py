@@ -200,7 +200,7 @@ class Record(msgspec.Struct):
             require(
                 (run.metrics is None) != (run.state == "done"),
                 f"runs[{index}].metrics",
-                expected="values for a finished run, and null for another",
+                expected="values for a finished run, and null for a run that is not finished",
                 found=shortened(run.metrics),
                 remedy=REMEDY,
             )

@@ -327,7 +327,7 @@ class _PresentedFolder:
                     name,
                     expected="a value of the run itself",
                     found=f"a value of its scene ({self._scene_folder / PRESENTATION_FILE})",
-                    remedy=f"Remove it there ({command('present', self._scene_folder)}), or set another for the run.",
+                    remedy=f"Remove it there ({command('present', self._scene_folder)}), or set another value for it.",
                 )
 
     def pixel(self, text: str) -> tuple[str, float, float] | None:

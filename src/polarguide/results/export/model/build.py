@@ -303,7 +303,7 @@ def _textures(
     shading = run.model.shading
     specular = None
     if isinstance(shading, DeferredShading) and shading.blend == "fresnel":
-        # The file has one index. A factor gives other indices their reflectance at normal incidence.
+        # The file has one refractive index. A factor gives texels with another index the right reflectance.
         ratio = _normal_reflectance(baked.index) / _normal_reflectance(np.float32(_index(run)))
         specular = linear_pixels(texels.texture((baked.strength * ratio)[:, None]))[..., 0]
     return color_pixels(texels.texture(mixed)), linear_pixels(texels.texture(surface)), specular
