@@ -1,4 +1,4 @@
-"""``polarguide batch``: process each capture of a collection up to its exports, and write an overview page."""
+"""The verb ``polarguide batch``, which processes each capture of a collection and writes an overview page."""
 
 from __future__ import annotations
 

@@ -272,7 +272,7 @@ def present(
 
 
 class _PresentedFolder:
-    """Folder of a scene or a run, read on demand."""
+    """Folder of a scene or a run whose presentation is changed. Its files are read on demand."""
 
     def __init__(self, folder: Path, device: DeviceName, reporter: Reporter) -> None:
         require_folder(

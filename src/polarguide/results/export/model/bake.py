@@ -70,7 +70,7 @@ class Baked:
     added: Sequence[tuple[GltfTexture, NDArray[np.float32]]] = ()
 
     def filled(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Replace the values [M, C] of unseen texels by those of the nearest seen texels."""
+        """Replace the values [M, C] of unseen texels by values of the nearest seen texels."""
         values = values.copy()
         values[~self.seen] = values[self.nearest]
         return values
