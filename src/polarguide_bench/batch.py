@@ -1,4 +1,4 @@
-"""``polarguide batch``: process each capture of a collection up to its exports, and write an overview page."""
+"""The verb ``polarguide batch``, which processes each capture of a collection and writes an overview page."""
 
 from __future__ import annotations
 
@@ -162,7 +162,9 @@ def run_batch(
     Raises:
         PolarguideError: there are no captures, a recipe is unknown, or another batch is writing to ``out``.
     """
-    require(captures, "batch", expected="a capture", found="no capture", remedy="Name at least one.")
+    require(
+        captures, "batch", expected="a capture", found="no capture", remedy="Specify at least one capture."
+    )
     for capture in captures:
         recipe_named(capture.recipe)
     root = Path(out)

@@ -43,7 +43,7 @@ Step = Literal["prepare", "inspect", "train", "eval", "share", "export"]
 STEPS: tuple[Step, ...] = ("prepare", "inspect", "train", "eval", "share", "export")
 """Processing steps of a capture, in order."""
 NO_FILES = (0, 0, 0)
-"""Stamp of an empty or missing folder."""
+"""Stamp (number, size, newest time) of an empty or missing folder."""
 
 
 @dataclass(frozen=True)

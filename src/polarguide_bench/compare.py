@@ -203,7 +203,7 @@ def ablated(base: str, only: Sequence[str] = ()) -> tuple[str, ...]:
         "base",
         expected="a recipe with ablations: " + ", ".join(ABLATIONS),
         found=base,
-        remedy="Take one of these, or use compare.",
+        remedy="Choose one of these recipes, or use compare.",
     )
     selected = [name.removeprefix(f"{base}:") for name in only]
     for name in selected:
@@ -221,14 +221,14 @@ def _checked_recipes(recipes: Sequence[str | AnyRecipe]) -> tuple[AnyRecipe, ...
             "recipes",
             expected=f"the registered recipe {own.name}",
             found="a recipe of this name with other values",
-            remedy="Give it another name, and register it under the entry points polarguide.recipes.",
+            remedy="Rename the recipe, and register it as an entry point of the group polarguide.recipes.",
         )
         require(
             own.name not in registered,
             "recipes",
             expected="no name more than once",
             found=f"{own.name} twice",
-            remedy="Name each once.",
+            remedy="List each name once.",
         )
         registered[own.name] = own
     require(registered, "compare", expected="a recipe", found="none", remedy="Name at least one recipe.")
@@ -318,7 +318,9 @@ def locked(folder: Path, what: str = "comparison") -> contextlib.AbstractContext
     their states.
     """
     return only_writer(
-        folder / ".lock", expected="a folder that nobody is writing to", found=f"another {what} at work in it"
+        folder / ".lock",
+        expected="a folder to which no other command is writing",
+        found=f"another {what} at work in it",
     )
 
 

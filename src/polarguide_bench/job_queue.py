@@ -48,12 +48,12 @@ WORKER_BYTES = 300_000_000
 CONNECT_SECONDS = 30.0
 """Timeout for the connection to a running scheduler, in seconds."""
 SETTINGS = {
-    # The scheduler reports a lost worker at once: run_jobs decides whether the job resumes.
+    # The scheduler reports a lost worker at once, and run_jobs decides if the job resumes.
     "distributed.scheduler.allowed-failures": 0,
     "distributed.deploy.lost-worker-timeout": "2s",
     "distributed.worker.memory.terminate": False,
     "distributed.worker.memory.pause": False,
-    # No profiling, and little monitoring.
+    # Profiling is disabled, and monitoring is reduced.
     "distributed.worker.profile.enabled": False,
     "distributed.admin.tick.interval": "1s",
     "distributed.admin.system-monitor.interval": "10s",
@@ -366,9 +366,9 @@ def _outcome_of(future: Future) -> Outcome:
     require(
         not future.cancelled(),
         "scheduler",
-        expected="a scheduler until the end",
+        expected="a connection to the scheduler until all jobs have ended",
         found="a lost connection",
-        remedy="Give the same command again when a scheduler is running. It resumes.",
+        remedy="Start the scheduler, and repeat the command. It resumes.",
     )
     error = future.exception() if future.status == "error" else None
     if isinstance(error, KilledWorker):

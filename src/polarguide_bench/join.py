@@ -237,8 +237,8 @@ def join_tables(
     require(
         len(paths) == 1 or written not in map(os.path.realpath, paths),
         out,
-        expected="a folder other than those of the parts",
-        found=f"the folder of a part, whose {RECORD} would be overwritten",
+        expected="a folder that contains none of the joined records",
+        found=f"the folder of a joined record, whose {RECORD} would be overwritten",
         remedy="Give another --out.",
     )
     joined = Results(join_records({str(path): read_results(path) for path in paths}, against=against))
@@ -286,9 +286,9 @@ def join_records(records: dict[str, Record], *, against: str | None = None) -> R
             require(
                 earlier is run or "missing" in (run.state, earlier.state),
                 name,
-                expected="runs that no other record has",
+                expected="runs that occur in only one record",
                 found=f"{run.scene}, {run.recipe}, seed {run.seed} once more",
-                remedy="Name every record once.",
+                remedy="List each record once, and no record that contains runs of another.",
             )
             if earlier.state == "missing":
                 runs[place] = run

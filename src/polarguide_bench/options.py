@@ -56,9 +56,9 @@ class ClusterOptions:
         require(
             len(places) <= 1,
             places[-1] if places else "",
-            expected="one place of the computation",
+            expected="at most one option that selects where the runs are computed",
             found=" and ".join(places),
-            remedy="Leave one out.",
+            remedy="Omit all but one of these options.",
         )
 
     @property
@@ -106,9 +106,9 @@ class CompareOptions(ClusterOptions, SceneOptions):
         require(
             self.local or not self.speed,
             "speed",
-            expected="this machine without other work",
+            expected="a comparison on this machine, because other jobs falsify times",
             found="a cluster",
-            remedy="Leave it out. After all trainings repeat the command with --speed and without the cluster.",
+            remedy="Omit this option. After all trainings, repeat the command with --speed and without the cluster.",
         )
         check_count("report_views", self.report_views, 0)
         for name in self.exposures:
@@ -118,7 +118,7 @@ class CompareOptions(ClusterOptions, SceneOptions):
             "exposures",
             expected="different kinds",
             found=" ".join(self.exposures),
-            remedy="Name each once.",
+            remedy="List each kind once.",
         )
 
 

@@ -100,7 +100,7 @@ class Comparison:
                 rows.append(TableRow(recipe.name, recipe, self.settings.exposures, steps))
             for exposures in self.options.exposures:
                 name = exposures if len(self.recipes) == 1 else f"{recipe.name} {exposures}"
-                # Pictures without polarization are for the recipe without its polarization terms, if it exists.
+                # For pictures without polarization, the variant without polarization terms is trained, if it exists.
                 controls = {r.name: r for r in ablations_of(recipe.name) if exposures == "none"}
                 control = controls.get(f"{recipe.name}:unpolarized", recipe)
                 rows.append(TableRow(name, control, exposures, steps))
@@ -244,14 +244,14 @@ def scene_entries(comparison: Comparison, reporter: Reporter = SILENT) -> list[S
             path,
             expected="scenes with different names",
             found=f"{scene.name} twice",
-            remedy="Rename a folder.",
+            remedy="Rename one of the folders.",
         )
         require(
             scene.test_names,
             path,
             expected="test views",
             found="none",
-            remedy="Name some in split.json to score on.",
+            remedy="List test views in split.json.",
         )
         if comparison.settings.refractive_index is None and scene.refractive_index is not None:
             reporter.say(f"{scene.name}: refractive index {scene.refractive_index:g} of scene.json")
@@ -392,7 +392,7 @@ def trained_steps(run: Path) -> int | None:
 
 
 def compared_steps(*specified: int | None) -> int:
-    """Return the first number of steps that is not None, or ``STEPS`` if all are None.
+    """Return the first specified number of steps, or ``STEPS`` if no number is specified.
 
     In a comparison, the number does not depend on the size of the pictures, so that scenes are comparable.
     """

@@ -180,7 +180,7 @@ def curves_svg(curves: Sequence[Curve], axis: str) -> str:
 
 
 def read_study(scene: Path) -> tuple[str, float] | None:
-    """Read the name and the value of the studied parameter from ``scene.json``. Return None if there is none."""
+    """Read the studied parameter from ``scene.json``: its name and value, or None if the file has no parameter."""
     try:
         study = json.loads((scene / "scene.json").read_text(encoding="utf-8"))["study"]
         return str(study["parameter"]), float(study["value"])

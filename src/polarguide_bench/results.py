@@ -200,7 +200,7 @@ class Record(msgspec.Struct):
             require(
                 (run.metrics is None) != (run.state == "done"),
                 f"runs[{index}].metrics",
-                expected="values for a finished run, and null for another",
+                expected="values for a finished run, and null for a run that is not finished",
                 found=shortened(run.metrics),
                 remedy=REMEDY,
             )
@@ -595,7 +595,7 @@ class Results:
     def differences(self) -> pd.DataFrame:
         """Data frame of paired differences ``recipe - other`` in each metric, with confidence interval and noise.
 
-        In rows of differences over all scenes, the scene is None.
+        Rows of differences over all scenes have the scene None.
         """
         frame = pd.DataFrame(self.compared, columns=[*DIFFERENCE_FIELDS])
         return frame.astype({"mean": float, "low": float, "high": float})

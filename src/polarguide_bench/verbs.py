@@ -97,9 +97,9 @@ def chosen_steps(values: tuple[str, ...]) -> tuple[int | None, dict[str, int]]:
         if number is None or name in steps:
             raise PolarguideError(
                 "--steps",
-                expected="a number of steps, and RECIPE=STEPS for a recipe with its own number, each once",
+                expected="one number of steps for all recipes, and at most one RECIPE=STEPS for each recipe",
                 found=" ".join(values),
-                remedy="For example --steps 5000 gnerp=10000.",
+                remedy="Follow the example --steps 5000 gnerp=10000.",
             )
         steps[name] = number
     return steps.pop("", None), steps
@@ -121,7 +121,7 @@ def print_results(results: Results, out: Path) -> None:
         out,
         expected=f"{len(runs)} finished runs",
         found=f"{len(failed)} failed runs ({', '.join(failed)})",
-        remedy="Results of the other runs have been written. Remove the cause and give the same command again.",
+        remedy="Results of the other runs have been written. Remove the cause, and repeat the command.",
     )
 
 
@@ -257,7 +257,7 @@ def batch(
             out,
             expected=f"{len(rows)} finished captures",
             found=f"{len(failed)} failed captures ({'; '.join(failed)})",
-            remedy="The others are finished. Remove the cause and give the same command again.",
+            remedy="All other captures are finished. Remove the cause, and repeat the command.",
         )
 
     if watch is None:
@@ -368,7 +368,7 @@ def _table(file: Path) -> list[_Line]:
         f"{file} (first line)",
         expected="the columns name and path, and optionally sensor and options",
         found=", ".join(map(repr, columns)) or "nothing",
-        remedy="Write them into the first line.",
+        remedy="Write the names of the columns into the first line.",
     )
     lines = []
     for number, row in rows[1:]:
@@ -377,8 +377,8 @@ def _table(file: Path) -> list[_Line]:
             len(row) == len(columns),
             where,
             expected=f"{len(columns)} values",
-            found="more" if len(row) > len(columns) else "fewer",
-            remedy="Put values with a delimiter in them into double quotes.",
+            found="more values" if len(row) > len(columns) else "fewer values",
+            remedy="Put each value that contains a delimiter into double quotes.",
         )
         values = dict(zip(columns, row, strict=True))
         require(values["path"], where, expected="a path", found="an empty value", remedy="Name its folder.")

@@ -92,7 +92,7 @@ def _prepare(task: Processing, scene: Path, folder: Path) -> None:
             prepared.folder,
             expected="a scene with poses",
             found="a scene without poses",
-            remedy="Give --poses sfm or --poses PATH among its options.",
+            remedy="Add --poses sfm or --poses PATH to the options of the capture.",
         )
 
 
@@ -170,7 +170,7 @@ def main() -> int:
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, signal.default_int_handler)
     keep_freed_memory()
-    # Unbuffered: a waiting thread would hold the lock of a buffer when the process ends.
+    # The input is not buffered, because a waiting thread would hold the buffer's lock when the process ends.
     stdin = io.FileIO(0, closefd=False)
 
     def stop_at_end_of_input() -> None:

@@ -41,7 +41,7 @@ def atomic(path: Path) -> Iterator[Path]:
             yield temporary
             with open(temporary, "rb") as file:
                 os.fsync(file.fileno())
-            temporary.chmod(rights)  # some libraries replace the file by one that only the owner may read
+            temporary.chmod(rights)  # some libraries replace the file by a file that only its owner may read
             os.replace(temporary, path)
             _sync_folder(path.parent)
         finally:
@@ -248,7 +248,7 @@ def require_inside(folder: Path, *paths: Path) -> None:
                 path,
                 expected=f"a place in {folder}",
                 found=f"a link to {real}",
-                remedy="Remove the link, or name the other place with --out; nothing was written there.",
+                remedy="Remove the link, or specify the linked folder with --out. No file was written there.",
             )
 
 

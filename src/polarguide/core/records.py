@@ -268,7 +268,7 @@ def shortened(value: Any, most: int = 100) -> str:
 def first_differing_value(name: str, a: Any, b: Any) -> tuple[str, Any, Any]:
     """Return the name of the first field in which two records differ, and both values.
 
-    A value is None if it is not recorded. The name of a nested field is a path, such as
+    None represents a value that is not recorded. The name of a nested field is a path, such as
     ``recipe_data.metal_rules.begin``.
     """
     if isinstance(a, dict) and isinstance(b, dict):

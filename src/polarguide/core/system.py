@@ -102,7 +102,7 @@ class StopSignals:
                 interrupt(number, frame)
             self._stopping = True
         elif number == signal.SIGTERM and process_count() > 1:
-            # torchrun ends the other processes when one is lost: leave that process time for its message.
+            # torchrun ends all processes when one of them fails. Give the failed process time to print its message.
             timer = threading.Timer(LAST_WORDS_SECONDS, os._exit, (128 + number,))
             timer.daemon = True
             timer.start()
@@ -153,7 +153,7 @@ def only_writer(lock: Path, *, expected: str, found: str) -> Iterator[None]:
                 remedy="Wait until the other command has ended, or choose another folder with --out.",
             ) from None
         except OSError:
-            if not is_folder:  # some network disks do not support locks of folders
+            if not is_folder:  # some network file systems cannot lock folders
                 raise
         os.set_inheritable(handle, not is_folder)
         yield
@@ -201,7 +201,7 @@ class MemoryBound:
     def keep(self) -> None:
         """Return freed memory to the system near the limit. Call it once per step if steps allocate similar sizes."""
         resident = resident_memory()
-        if self._waits:  # steps allocate up to the largest of them again, so nothing can be returned below it
+        if self._waits:  # memory below the largest step would be allocated again at once
             self._most = max(self._most, resident)
             self._waits -= 1
             self._bound = min(max(self._least, GROWTH * self._most), self._limit)
@@ -365,5 +365,5 @@ def check_variables() -> None:
             f"the variable {name}",
             expected=expected,
             found=repr(os.environ[name][:100]),
-            remedy=f"Correct it, or unset {name}.",
+            remedy=f"Correct the value, or unset {name}.",
         )

@@ -253,7 +253,7 @@ class Frusta:
                 handle.visible = visible
 
     def show_box(self, crop: Crop | None) -> None:
-        """Draw a crop box, or remove the drawn box if ``crop`` is None."""
+        """Draw a crop box. None removes the drawn box."""
         if self._box is not None:
             self._box.remove()
             self._box = None

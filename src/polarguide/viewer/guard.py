@@ -222,7 +222,7 @@ def _given(option: str, name: str) -> str:
     host = host_of(name if "://" in name else f"//{name}", schemes=("", *WEB))
     if host is None or not (_is_address(host) or _NAME.fullmatch(host)):
         raise PolarguideError(
-            option, expected="a name such as viewer.example.org", found=name, remedy="Give the name alone."
+            option, expected="a name such as viewer.example.org", found=name, remedy="Omit all but the name."
         )
     return host
 
@@ -239,8 +239,8 @@ MOST_BROWSERS = 32
 MESSAGES_PER_SECOND = 200.0
 BURST = 400.0  # number of messages
 SENDING_SECONDS = 30.0  # timeout of a browser that receives nothing
-# viser's page connects to any server that its address names (?websocket=, ?playbackPath=), and obeys it. The policy
-# restricts it to its own origin. Not every browser applies 'self' to sockets.
+# viser's page connects to any server that its URL names (?websocket=, ?playbackPath=) and trusts this server. The
+# policy restricts connections to the page's own origin. Not every browser applies 'self' to sockets.
 POLICY = (
     "frame-ancestors 'self'; connect-src 'self' ws://{host} wss://{host} blob: data:; object-src 'none'; "
     "base-uri 'none'; form-action 'none'"
@@ -308,7 +308,7 @@ def _gated(process: Any, gate: Gate) -> Callable[[Any, Any], Any]:
         if response is not None:
             for name, value in HEADERS.items():
                 response.headers[name] = value
-            # The gate accepts only addresses and known names as Host, with their port.
+            # The gate accepts a Host only if it is an address or a known name, with an optional port.
             response.headers["Content-Security-Policy"] = POLICY.format(host=request.headers["Host"])
         return response
 

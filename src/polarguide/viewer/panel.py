@@ -258,7 +258,7 @@ class Panel:
             self._status.content = text
 
     def crop(self, up_axis: Vector | None = None) -> Crop | None:
-        """Return the crop box, or None without cropping. If ``up_axis`` is None, the cameras' up axis is used."""
+        """Return the crop box, or None without cropping. Without ``up_axis``, the cameras' up axis is used."""
         if not self["crop"].value:
             return None
         if self._saved_crop is not None:

@@ -231,7 +231,7 @@ class Viewer:
             left = deadline - time.monotonic()
             if left <= 0:
                 return False
-            # Sharp pictures and animations become due without an event.
+            # No event announces that a sharp picture or a picture of an animation is due.
             self._wake.wait(min(left, TICK if self._sessions else 1.0))
 
     def _draw_next(self) -> bool:
@@ -287,7 +287,7 @@ def _listening(viser: Any, host: str, port: int, title: str) -> Any:
         return viser.ViserServer(host=host, port=port, label=title, verbose=False)
 
 
-PATIENCE = 0.2  # time in seconds between two checks for the end of a paused training
+PATIENCE = 0.2  # interval in seconds at which a paused training checks if it must end
 
 
 def view_run(
@@ -316,8 +316,8 @@ def view_run(
         raise PolarguideError(
             beside.folder,
             expected=f"a run of {run.configuration.scene}",
-            found=f"one of {beside.configuration.scene}",
-            remedy="Name another run, or train one on this scene.",
+            found=f"a run of {beside.configuration.scene}",
+            remedy="Choose a run of this scene, or train a run on it.",
         )
     scenery = run_scenery(run)
     with _opened(
@@ -405,7 +405,7 @@ def watched(
             "viewer",
             expected="one process",
             found=f"{loop.ranks.world}",
-            remedy="Leave it out, and look at the checkpoints: polarguide view RUN.",
+            remedy="Omit this option, and view the checkpoints with polarguide view RUN.",
         )
     scene = loop.context.scene
 

@@ -466,7 +466,7 @@ def depth_picture(depth: Tensor, depths: Depths) -> Picture:
 def layer_scale(name: str, depths: Depths | None = None) -> Picture | None:
     """Return the legend of a layer, 256 pixels wide.
 
-    Return None for radiance, which needs no legend, and for depth if ``depths`` is None.
+    Return None for radiance, which needs no legend, and for depth without ``depths``.
     """
     name = name.partition(",")[0]
     if name in _SHARES:

@@ -68,8 +68,7 @@ class Region:
         return (points - points.new_tensor(self.center)) / self.unit
 
     def cube(self, inner: Tensor) -> tuple[Tensor, Tensor]:
-        """Map coordinates [..., 3] of the field to the cube [-1, 1]^3 of the grids; return also the derivatives [...,
-        3].
+        """Map coordinates [..., 3] of the field to the grids' cube [-1, 1]^3; return also the derivatives [..., 3].
 
         Coordinates beyond 1 are contracted by ``2 - 1/x``, separately along each axis. Mip-NeRF 360 (Barron et al.
         2022) contracts the radius in this way. Gradients are also converted separately along each axis.
@@ -86,7 +85,7 @@ class Region:
         return torch.where(along.abs() > 1, along.sign() / (2 - along.abs()), along)
 
     def surroundings(self, inner: Tensor) -> Tensor:
-        """Map coordinates [..., 3] outside the sphere to the ball of radius 1 in which the background's grids are defined."""
+        """Map coordinates [..., 3] outside the sphere to a ball of radius 1, the domain of the background's grids."""
         distance = inner.norm(dim=-1, keepdim=True).clamp(min=self.radius)
         return inner / distance * (1 - 0.5 * self.radius / distance)
 
@@ -236,7 +235,7 @@ class Background(nn.Module):
         self.head = network((self.grids.width, shape.width, 4), generator)
 
     def forward(self, places: Tensor) -> tuple[Tensor, Tensor]:
-        """Compute density [N] and display colors [N, 3] at positions in a ball of radius 1 (``Region.surroundings``)."""
+        """Compute density [N] and display colors [N, 3] at positions in the ball of ``Region.surroundings``."""
         values = self.head(self.grids(places))
         return softplus(values[:, 0]), torch.sigmoid(values[:, 1:])
 

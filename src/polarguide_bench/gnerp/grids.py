@@ -36,8 +36,9 @@ class _Gather(torch.autograd.Function):
 
 
 class SmoothGrids(nn.Module):
-    """Scalar function: a sum of quadratic B-splines on several grids. It has a continuous gradient and is initially
-    zero.
+    """Scalar function: a sum of quadratic B-splines on several grids, initially zero.
+
+    Its gradient is continuous.
 
     Args:
         resolutions: number of cells of each grid along a side of the cube [-1, 1]^3.
@@ -121,7 +122,7 @@ def _quadratic(t: Tensor) -> Tensor:
 
 
 def _cell(places: Tensor, resolution: int) -> tuple[Tensor, Tensor]:
-    """Return the index [...] of the cell of each position along an axis, and the position within the cell, in [0, 1]."""
+    """Return the cell index [...] of each position along an axis, and the position within the cell, in [0, 1]."""
     scaled = (0.5 * resolution) * (places.clamp(-1, 1) + 1)
     cell = scaled.floor().clamp(max=resolution - 1)
     return cell, scaled - cell

@@ -286,7 +286,7 @@ class FieldLoop(Loop):
         )
 
     def _neighbors(self, marched: RaySamples, camera: Camera, rays: Tensor, chosen: Tensor) -> Tensor:
-        """Return six positions around each sample, [N, K, 6, 3]: four on rays of diagonal pixels, and two along the ray."""
+        """Return six positions around each sample, [N, K, 6, 3]: four on rays of diagonal pixels, two along the ray."""
         places = marched.places.gather(1, chosen[..., None].expand(-1, -1, 3))
         width = (marched.along.gather(1, chosen) / camera.fx)[..., None]
         pose = camera.pose(places.dtype, places.device)
@@ -297,7 +297,10 @@ class FieldLoop(Loop):
         return torch.stack([places + step for step in (*steps, ahead, -ahead)], dim=2)
 
     def _view_of(self, place: int) -> View:
-        """Return the view at an index of the training sequence, in which each epoch contains each view once, in a new order."""
+        """Return the view at an index of the training sequence.
+
+        Each epoch of the sequence contains each view once, in a new order.
+        """
         views = self.scene.train_views
         epoch, place = divmod(place, len(views))
         order = torch.randperm(len(views), generator=seeded(self.settings.seed, 4, epoch))

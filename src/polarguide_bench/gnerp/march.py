@@ -92,7 +92,7 @@ def march(
     rays = direction[:, None].expand(-1, fine, -1).reshape(-1, 3)
     geometry = field.geometry(flat)
     normals = unit(geometry.slope)
-    # The color has no gradient in normals: grids would imitate texture with bumps.
+    # The color has no gradient with respect to normals. Otherwise grids would explain texture by bumps.
     colors = field.color(flat, rays, normals.detach(), geometry.features).view(count, fine, 3)
     falling = dot(rays, geometry.slope).view(count, fine).clamp(max=0)
     distance = geometry.distance.view(count, fine)

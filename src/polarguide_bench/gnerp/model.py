@@ -80,7 +80,7 @@ class FieldModel:
 
     @torch.no_grad()
     def alpha_in_front(self, camera: Camera, depth: Tensor) -> Tensor:
-        """Return the share [H, W] of each pixel's opacity in front of a depth [H, W]. It is 0 if the depth is not positive."""
+        """Return the share [H, W] of each pixel's opacity in front of a depth [H, W], or 0 at depths up to 0."""
         rays = camera.rays(device=self.device).view(-1, 3)
         far = depth.to(rays).flatten() / rays[:, 2] / self.field.region.unit
         shares = []

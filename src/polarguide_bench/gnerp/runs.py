@@ -235,6 +235,6 @@ def resolve_field(
             name,
             expected=f"{most} with the recipe {recipe.name}, a field",
             found=str(values[name]),
-            remedy="Leave it out.",
+            remedy="Omit this option.",
         )
     return ResolvedSettings(**values)

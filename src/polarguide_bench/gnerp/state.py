@@ -16,8 +16,8 @@ from polarguide_bench.gnerp.field import Field, GridField, NetworkField, Region
 from polarguide_bench.gnerp.recipe import NeuralRecipe
 
 KINDS: dict[str, type[Field]] = {"grids": GridField, "networks": NetworkField}
-# Settings of Adam. With a longer memory of the squares, the first ray through a node after a thousand steps would move
-# it too far.
+# Settings of Adam. With a longer averaging of squared gradients, a node that no ray has reached for a thousand steps
+# would move too far at the next ray.
 BETAS = (0.9, 0.99)
 EPSILON = 1e-15
 

@@ -83,7 +83,7 @@ class Coverage:
     def add(self, training: DepthMap) -> None:
         """Add a training view, and mark the held-out pixels whose content it shows."""
         camera = training.camera
-        # The farthest depth of the neighborhood: at an edge a pixel may show either surface.
+        # The farthest depth of the neighborhood is used, because a pixel at an edge may show either surface.
         edges = training.depth.nan_to_num(posinf=torch.finfo(torch.float64).max)[None, None]
         farthest = functional.max_pool2d(edges, 3, stride=1, padding=1)[0, 0]
         background = functional.max_pool2d(training.depth.isinf().double()[None, None], 3, 1, 1)[0, 0] > 0

@@ -438,7 +438,7 @@ def _score(
     by_object: ErrorsByObject,
     sheet: ErrorSheet,
 ) -> ViewScores:
-    # The target comes first: a later copy to the device would wait for the rendering.
+    # The target is created first, because a later copy to the device would wait for the rendering.
     target = ViewTarget.of_view(view, facts, run.model.device).with_coverage(seen)
     result = run.model.render(view.camera, depth=True, surface=True)
     stokes = run.model.stokes(result, view.camera)

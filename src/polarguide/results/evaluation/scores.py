@@ -139,11 +139,12 @@ _UNDETERMINED = "the pictures of the view do not determine the Stokes vectors"
 _NO_POLARIZATION = "the measured polarization of the scored pixels is negligible"
 
 ViewScores = dict[str, float | str | None]
-"""Scores of one view by key. A score is None without ground truth, without the layer, or without a pixel to score.
+"""Scores of one view by key. None represents a missing score.
 
-The texts ``lpips_reason``, ``flip_reason`` and ``stokes_error_reason`` explain why ``lpips``, ``flip`` and
-``stokes_error`` are missing. ``nonfinite_pixels`` is the number of pixels with NaN or infinity in a rendered layer. It
-is present only if there are such pixels. They are scored as black, and their normals with an error of 90 degrees.
+A score is missing without ground truth, without the layer, or without a pixel to score. The texts ``lpips_reason``,
+``flip_reason`` and ``stokes_error_reason`` explain why ``lpips``, ``flip`` and ``stokes_error`` are missing.
+``nonfinite_pixels`` is the number of pixels with NaN or infinity in a rendered layer. It is present only if there are
+such pixels. They are scored as black, and their normals with an error of 90 degrees.
 """
 
 

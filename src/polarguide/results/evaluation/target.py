@@ -164,14 +164,14 @@ JUMP_MARGIN = 2
 class ViewTarget:
     """Photograph, ground truth and pixels to score of a view, on one device; floats are float64.
 
-    An attribute is None if its data is missing.
+    None represents missing data.
 
     Attributes:
         photograph: [H, W, 3] linear, S0/2.
         valid: pixels of the photograph to score.
         windows: pixels of ``valid`` that are centers of SSIM windows.
         foreground: valid pixels of the true mask. Without a mask, this attribute and all attributes up to ``diffuse``
-            are None.
+            are missing.
         reflective: foreground pixels dominated by reflection.
         surface: foreground pixels with a true normal.
         normal: [H, W, 3] world.

@@ -1,1 +1,1 @@
-"""Trained scenes as the files of other tools."""
+"""Export of trained scenes to file formats of other programs."""

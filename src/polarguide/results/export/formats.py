@@ -98,7 +98,7 @@ def export_cameras(run: OpenedRun, presented: Presented, folder: Path, reporter:
     placement = presented.placement
     cameras = {name: placement.camera(camera) for name, camera in run.cameras.items()}
     about = {**presented.origin.record(), **placement.record()}
-    # This file comes first: a repeated command recognizes an interrupted export by it.
+    # This file is written first. A repeated command recognizes an interrupted export by it.
     write_transforms(folder / TRANSFORMS, cameras, about)
     make_folder(images)
     color = presented.presentation.color
@@ -290,7 +290,7 @@ class _Exporter:
 
     def spz(self) -> list[Path]:
         """Write an SPZ file in units of the scene, because the format rounds positions to 1/4096 of a unit."""
-        # Readers expect +y up and revert this half turn.
+        # Programs expect +y up and revert this half turn.
         half_turn = torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))
         rotation = half_turn @ self.presented.placement.rotation
         placement = replace(self.presented.placement, rotation=rotation, scale=1.0, metric=False)

@@ -240,7 +240,7 @@ def _nearest(points: Tensor, means: Tensor) -> Tensor:
 
 def _morton_order(means: Tensor) -> Tensor:
     """Return the indices that sort points in Morton order. Neighbors in space then lie together and compress well."""
-    # Ranks instead of positions: distant Gaussians would compress all others into one cell.
+    # Ranks are used instead of positions, because distant Gaussians would compress all others into one cell.
     ranks = means.argsort(dim=0).argsort(dim=0)
     return curve_places((ranks * 1024) // max(1, len(means))).argsort(stable=True)
 

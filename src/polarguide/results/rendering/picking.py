@@ -15,10 +15,10 @@ from polarguide.geometry.camera import Camera
 from polarguide.geometry.vectors import unit
 from polarguide.shading.result import RenderResult
 
-LEAST_ALPHA = 0.5  # of a surface
+LEAST_ALPHA = 0.5  # minimum alpha of a surface
 LEAST_GAIN = 0.02
 MOST_GAIN = 50.0
-# Limits of a picked white.
+# Limits of a color that is picked for the white balance.
 DARKEST = 2e-3
 BRIGHTEST = 0.98
 PATCH = 2  # radius in pixels over which a picked color is averaged
@@ -140,5 +140,5 @@ def gray_world_gains(views: Iterable[View]) -> Vector:
         total += view.photograph()[valid].double().sum(dim=0)
         count += int(valid.sum())
     mean = total / max(count, 1)
-    # The gains do not depend on the brightness: black around an object changes nothing.
+    # The gains do not depend on brightness, so black pixels around an object have no effect.
     return white_balance_gains(0.5 * mean / max(float(mean.max()), 1e-12))

@@ -272,7 +272,7 @@ def present(
 
 
 class _PresentedFolder:
-    """Folder of a scene or a run, read on demand."""
+    """Folder of a scene or a run whose presentation is changed. Its files are read on demand."""
 
     def __init__(self, folder: Path, device: DeviceName, reporter: Reporter) -> None:
         require_folder(
@@ -327,7 +327,7 @@ class _PresentedFolder:
                     name,
                     expected="a value of the run itself",
                     found=f"a value of its scene ({self._scene_folder / PRESENTATION_FILE})",
-                    remedy=f"Remove it there ({command('present', self._scene_folder)}), or set another for the run.",
+                    remedy=f"Remove it there ({command('present', self._scene_folder)}), or set another value for it.",
                 )
 
     def pixel(self, text: str) -> tuple[str, float, float] | None:

@@ -105,7 +105,7 @@ def mirrored_light(run: OpenedRun, cubemap: RadianceCubemap, advance: Advance) -
         share = ratio.clamp(0, 1)[..., None].square()
         directions = mirrored(view.camera.world_rays(), unit(result.normal, 1e-3)).reshape(-1, 3)
         with torch.enable_grad():
-            # The gradient of a look-up distributes a pixel among its texels.
+            # The gradient of a texture look-up distributes the value of a pixel among its texels.
             cubemap_lookup(sums, directions).backward(
                 torch.cat([share * light, share], dim=-1).reshape(-1, 4)
             )
@@ -139,7 +139,7 @@ def cubemap_of_panorama(
     x, y, z = directions.unbind(-1)
     across = torch.atan2(x, -z) / math.pi
     down = -2 / math.pi * torch.asin(y.clamp(-1, 1))
-    # One more column on each side: the panorama is periodic.
+    # The panorama is periodic, so a column is added on each side.
     wide = pad(picture.double().movedim(-1, 0)[None], (1, 1, 0, 0), mode="circular")
     width = picture.shape[1]
     places = torch.stack((across * width / (width + 2), down), dim=-1).reshape(

@@ -70,7 +70,7 @@ class Baked:
     added: Sequence[tuple[GltfTexture, NDArray[np.float32]]] = ()
 
     def filled(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Replace the values [M, C] of unseen texels by those of the nearest seen texels."""
+        """Replace the values [M, C] of unseen texels by values of the nearest seen texels."""
         values = values.copy()
         values[~self.seen] = values[self.nearest]
         return values
@@ -172,7 +172,7 @@ def _reliable_depth(result: RenderResult, view: View | None) -> Tensor:
     depth = result.depth
     far = max_pool2d(depth[None, None], 3, 1, 1)[0, 0]
     near = -max_pool2d(-depth[None, None], 3, 1, 1)[0, 0]
-    # A pixel between depths that differ by more than the thickness of the surface picture mixes two surfaces.
+    # If depths next to a pixel differ by more than the surface thickness, the pixel mixes two surfaces.
     solid = (result.alpha > OPAQUE) & (far - near < 2 * WIDTH * depth)
     if view is not None:
         solid &= ~view.invalid.cpu()

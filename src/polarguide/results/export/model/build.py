@@ -181,7 +181,7 @@ def textured_model(
 def _presented(
     baked: Baked, light: NDArray[np.float32] | None, color: Tensor | None, index: float, reporter: Reporter
 ) -> tuple[NDArray[np.float32], Baked]:
-    """Apply the color of the presentation, and divide radiance by ``light``, the irradiance [M, 3], unless it is None.
+    """Apply the color of the presentation, and divide radiance by the irradiance ``light`` [M, 3] if it is specified.
 
     The color of the presentation is applied to radiance and irradiance before the division.
 
@@ -303,7 +303,7 @@ def _textures(
     shading = run.model.shading
     specular = None
     if isinstance(shading, DeferredShading) and shading.blend == "fresnel":
-        # The file has one index. A factor gives other indices their reflectance at normal incidence.
+        # The file has one refractive index. A factor gives texels with another index the right reflectance.
         ratio = _normal_reflectance(baked.index) / _normal_reflectance(np.float32(_index(run)))
         specular = linear_pixels(texels.texture((baked.strength * ratio)[:, None]))[..., 0]
     return color_pixels(texels.texture(mixed)), linear_pixels(texels.texture(surface)), specular

@@ -189,7 +189,7 @@ def _material(model: Textured, *, jpeg: bool) -> tuple[list[tuple[str, bytes]], 
     material: dict[str, Any] = {"name": "surface", "pbrMetallicRoughness": shading}
     extensions: dict[str, Any] = {}
     if model.surface is None:
-        # Readers without the extension draw no highlight.
+        # Programs that do not support the extension draw no highlight.
         shading |= {"metallicFactor": 0.0, "roughnessFactor": 1.0}
         extensions["KHR_materials_unlit"] = {}
     else:
