@@ -112,8 +112,8 @@ def shortest_axis_normals(
         outward: [N, 3] direction from which each Gaussian is visible. It determines the sign at grazing angles. A zero
             vector means unknown.
 
-            Returns:
-                Normals [N, 3] in world axes, differentiable in the quaternions (Ye et al. 2024, Sec. 3.2).
+    Returns:
+        Normals [N, 3] in world axes, differentiable in the quaternions (Ye et al. 2024, Sec. 3.2).
     """
     center = center.detach().to(means).contiguous()
     if fits(means, quaternions, log_scales, outward):

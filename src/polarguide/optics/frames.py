@@ -62,8 +62,7 @@ def zenith(normals: Tensor, rays: Tensor) -> Tensor:
 
     Returns:
         [...] radians in [0, pi]. It is more than pi/2 if the normal faces away, and 0 for a zero normal. The gradient
-        is 0 if
-                the normal is parallel to the ray, while the gradient of an arc cosine would be infinite.
+        is 0 if the normal is parallel to the ray, while the gradient of an arc cosine would be infinite.
     """
     along = dot(normals, rays)
     across = torch.linalg.vector_norm(normals - along[..., None] * rays, dim=-1)

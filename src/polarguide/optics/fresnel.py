@@ -232,9 +232,9 @@ def specular_zeniths(dolp: Tensor, refractive_index: float | Tensor = 1.5) -> tu
     """Return the two zeniths at which specular light has a given degree of polarization d.
 
     They are the inverses of ``specular_dolp``. With ``q = tan i tan r``, Fresnel's equations give ``d = 2q / (1 +
-    q^2)``. Hence q is ``d / (1 + sqrt(1 - d^2))`` below Brewster's angle, and the reciprocal of this value above it. Then ``x = sin^2 i`` solves ``(1 - q^2) x^2 + q^2 (n^2 + 1) x -
-    q^2 n^2 = 0``. The roots are written with the square root in the denominator and computed as tangents, so that no
-    digits cancel at q = 1 (Brewster's angle) and q = 0.
+    q^2)``. Hence q is ``d / (1 + sqrt(1 - d^2))`` below Brewster's angle, and the reciprocal of this value above it.
+    Then ``x = sin^2 i`` solves ``(1 - q^2) x^2 + q^2 (n^2 + 1) x - q^2 n^2 = 0``. The roots are written with the square
+    root in the denominator and computed as tangents, so that no digits cancel at q = 1 (Brewster's angle) and q = 0.
 
     Args:
         dolp: [...]; clamped to [0, 1].
@@ -242,9 +242,8 @@ def specular_zeniths(dolp: Tensor, refractive_index: float | Tensor = 1.5) -> tu
 
     Returns:
         A tuple of the zenith below and the zenith above Brewster's angle, each [...] radians in [0, pi/2]. They are
-        equal
-                at d = 1. Gradients are set to 0 at d = 1, and for the zenith below also at d = 0, where they have no
-                limit.
+        equal at d = 1. Gradients are set to 0 at d = 1, and for the zenith below also at d = 0, where they have no
+        limit.
 
     Raises:
         ValueError: ``refractive_index`` is a number not above 1.

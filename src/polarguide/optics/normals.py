@@ -2,14 +2,13 @@
 
 The polarization of one pixel leaves several possible surface normals. The angle of polarization determines the azimuth
 only up to half a turn. Specular and diffuse light are polarized at right angles, which adds an ambiguity of a quarter
-turn. Zenith and
-azimuth are relative to the view ray of the pixel (see ``frames``). All normals are in camera axes.
+turn. Zenith and azimuth are relative to the view ray of the pixel (see ``frames``). All normals are in camera axes.
 
 A dielectric surface reflects light without changing its color, while light from below the surface has the color of the
 body. Differences between the color channels of a pixel are therefore mostly diffuse light. Their polarization reveals
-the diffuse lobe alone, for any amount of specular light. This combines the two colors of Nayar, Fang and Boult 1997 ("Separation
-of reflection components using color and polarization") with the polarization of diffuse light. In a channel c of a
-pixel,
+the diffuse lobe alone, for any amount of specular light. This combines the two colors of Nayar, Fang and Boult 1997
+("Separation of reflection components using color and polarization") with the polarization of diffuse light. In a
+channel c of a pixel,
 
     (S1, S2)_c = (rho_s specular - rho_d diffuse_c) (cos, sin)(2 (azimuth + pi/2)),
 
@@ -156,7 +155,8 @@ def disambiguate(
     The score of a candidate is the cosine between the candidate and the guide. With ``azimuth_weight`` w, the score is
     ``(1 - w s) cosine + w s cos(difference of azimuths)``, where s is the sine of the guide's zenith. A wrong
     refractive index or a mixture of lobes changes the zenith of a candidate, but not its azimuth. The azimuth is
-    therefore more reliable, unless the guide points to the camera and has no azimuth. Invalid candidates are chosen only if all are invalid.
+    therefore more reliable, unless the guide points to the camera and has no azimuth. Invalid candidates are chosen
+    only if all are invalid.
 
     Args:
         candidates: a record of candidates, or candidate normals [..., K, 3] in camera axes.
@@ -200,8 +200,8 @@ def dolp_noise(stokes: Tensor, noise_sigma: float | Tensor) -> Tensor:
 
     If each intensity has the standard deviation ``sigma``, S1 and S2 have ``sqrt(2) sigma``, and S0 has ``sigma``. S0
     is uncorrelated with S1 and S2. To first order, d has the standard deviation ``sigma sqrt(2 + d^2) / S0``, which is
-    ``sqrt(2) sigma / S0`` for weakly polarized light. For unpolarized light the measured d has a Rayleigh distribution with this scale: its mean
-    is 1.25 scales, and 1.1 % of the pixels exceed 3 scales.
+    ``sqrt(2) sigma / S0`` for weakly polarized light. For unpolarized light the measured d has a Rayleigh distribution
+    with this scale: its mean is 1.25 scales, and 1.1 % of the pixels exceed 3 scales.
 
     Args:
         stokes: [3, ...].

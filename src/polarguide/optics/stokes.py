@@ -89,7 +89,7 @@ def dolp(stokes: Tensor) -> Tensor:
 
     Returns:
         [...] in [0, 1]. Larger values, which noise may cause, are clamped. It is 0 if S0 <= 0. The gradient is 0 for
-                unpolarized light.
+        unpolarized light.
     """
     check_leading(stokes, 3, "stokes")
     s0 = stokes[0]
@@ -163,8 +163,8 @@ def filter_analyzer(angle: float | Tensor, rays: Tensor) -> Tensor:
     """Return the analyzer of a filter (sheet polarizer) in front of the lens.
 
     A filter absorbs the electric field along its absorption axis a, which is parallel to the picture. It transmits the
-    field perpendicular to a and to the ray d, along ``d x a``. In the lens frame of a pixel at normalized image position
-    (x, y) its angle differs from the mounting angle by up to about ``x y / 2`` radians.
+    field perpendicular to a and to the ray d, along ``d x a``. In the lens frame of a pixel at normalized image
+    position (x, y) its angle differs from the mounting angle by up to about ``x y / 2`` radians.
 
     Args:
         angle: angle of the transmission axis, radians counter-clockwise as displayed; a number or a tensor of one.
@@ -248,11 +248,11 @@ class Uncertainty(NamedTuple):
 def polarization_uncertainty(stokes: Tensor, variances: Tensor) -> Uncertainty:
     """Return the standard deviations of DoLP and AoLP, and the DoLP without the bias of noise.
 
-    Noise increases the DoLP, so that the measured DoLP of unpolarized light is positive. The debiased DoLP is the modified
-    asymptotic estimator ``d - b^2 (1 - exp(-d^2 / b^2)) / (2 d)`` with b the noise across the direction of polarization
-    (Plaszczynski, Montier, Levrier and Tristram 2014, "A novel estimator of the polarization amplitude from normally
-    distributed Stokes parameters", MNRAS 439, 4048). It is nearly unbiased if d is at least about 2 b. For unpolarized
-    light, four fifths of the bias remain. In this case, average Stokes vectors over regions instead.
+    Noise increases the DoLP, so that the measured DoLP of unpolarized light is positive. The debiased DoLP is the
+    modified asymptotic estimator ``d - b^2 (1 - exp(-d^2 / b^2)) / (2 d)`` with b the noise across the direction of
+    polarization (Plaszczynski, Montier, Levrier and Tristram 2014, "A novel estimator of the polarization amplitude
+    from normally distributed Stokes parameters", MNRAS 439, 4048). It is nearly unbiased if d is at least about 2 b.
+    For unpolarized light, four fifths of the bias remain. In this case, average Stokes vectors over regions instead.
 
     Args:
         stokes: [3, ...].
@@ -261,10 +261,8 @@ def polarization_uncertainty(stokes: Tensor, variances: Tensor) -> Uncertainty:
 
     Returns:
         Uncertainty to first order, which is accurate if the DoLP exceeds about three standard deviations. For
-        unpolarized
-                light, the AoLP has ``UNIFORM_SPREAD``, and the true standard deviation of the DoLP is 0.66 times the
-                returned
-                value.
+        unpolarized light, the AoLP has ``UNIFORM_SPREAD``, and the true standard deviation of the DoLP is 0.66 times
+        the returned value.
 
     Raises:
         ValueError: the first axis of ``stokes`` is not 3, or the first axis of ``variances`` is not 4.

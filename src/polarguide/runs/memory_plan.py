@@ -74,8 +74,8 @@ def plan_memory(
         limit: memory limit of the process in GiB. None means four fifths of the free memory.
         in_memory: True if the pictures are already in memory.
 
-            Raises:
-                PolarguideError: the specified limit is too small. The message contains the smallest sufficient limit.
+    Raises:
+        PolarguideError: the specified limit is too small. The message contains the smallest sufficient limit.
     """
     largest = max(pixels, default=0)
     floats = sum(math.prod(shape) for shape in recipe.shapes.values())

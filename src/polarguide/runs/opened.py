@@ -344,16 +344,13 @@ class OpenedRun:
 
         Args:
             camera: any camera, or the name of a view, for which the scene is read.
-                        layers: names of layers, see the property ``layers``.
+            layers: names of layers, see the property ``layers``.
 
-                    Returns:
-                        The layers by name. Most layers are linear radiance [H, W, 3] on the scale of S0/2. Normals are
-                        [H, W, 3]
-                        in world axes and have any length. Strength, roughness, metalness, depth and alpha are [H, W].
-                        Polarization is predicted: ``stokes`` is [3, H, W, 3] in the lens frame, as ``View.stokes``
-                            measures it.
-                        ``dolp`` [H, W] in [0, 1] and ``aolp`` [H, W] in [0, pi) radians are computed from its
-                        luminance.
+        Returns:
+            The layers by name. Most layers are linear radiance [H, W, 3] on the scale of S0/2. Normals are [H, W, 3] in
+            world axes and have any length. Strength, roughness, metalness, depth and alpha are [H, W]. Polarization is
+            predicted: ``stokes`` is [3, H, W, 3] in the lens frame, as ``View.stokes`` measures it. ``dolp`` [H, W] in
+            [0, 1] and ``aolp`` [H, W] in [0, pi) radians are computed from its luminance.
 
         Raises:
             PolarguideError: a layer is unknown, or this recipe does not render it.

@@ -82,9 +82,9 @@ def train_gaussians(
             between steps.
         callbacks: additional callbacks, see ``training.callback.Callback``. They run after the callbacks of the method.
 
-            Raises:
-                PolarguideError: the input is invalid, the folder is unsuitable, or a loss is not finite.
-                TrainingStopped: ``should_stop`` returned True. The state has been saved.
+    Raises:
+        PolarguideError: the input is invalid, the folder is unsuitable, or a loss is not finite.
+        TrainingStopped: ``should_stop`` returned True. The state has been saved.
     """
     out = Path(out)
     use_threads(session.threads)

@@ -331,8 +331,8 @@ def mips_backward(
 def mip_lookup(levels: Sequence[Tensor], directions: Tensor, level: Tensor) -> Tensor:
     """Look up the two nearest mip levels without seams, and interpolate linearly between them.
 
-    In float32 on the CPU, a native pass supports up to 16 levels and 64 channels. The gradient with respect to ``level``
-    is the difference of the two levels, and 0 beyond the ends.
+    In float32 on the CPU, a native pass supports up to 16 levels and 64 channels. The gradient with respect to
+    ``level`` is the difference of the two levels, and 0 beyond the ends.
 
     Args:
         levels: L textures [6, R_l, R_l, C] as returned by ``box_mips``.

@@ -1,4 +1,4 @@
-"""Deferred reflection per pixel of a learned environment (3DGS-DR, Ye et al. 2024), or Fresnel-weighted."""
+"""Deferred reflection of a learned environment per pixel, as in 3DGS-DR (Ye et al. 2024) or by Fresnel's equations."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ LOCAL_NOTE = (
     "Turning the environment turns reflections of distant surroundings. Gaussians themselves hold reflections of near "
     "surroundings, which do not turn."
 )
-"""Note on local light for readers of an export."""
+"""Note on local light for exports."""
 _REFLECTANCE = SurfaceProperty(
     "reflectance",
     "reflectance_logits",
@@ -61,7 +61,7 @@ _METALNESS = SurfaceProperty("metalness", "metalness", weight="metalness")
 _INDEX = SurfaceProperty("index", "index_offset", weight="index_offset")
 """Offset of a Gaussian's refractive index from the index of the run."""
 _OWN = ("strength", "blur", "reflectance", "metalness", "index")
-"""Surface properties that ``DeferredShading.shade`` reads; others are blended to layers of their names."""
+"""Names of the surface properties that ``DeferredShading.shade`` reads. Other properties become layers."""
 
 
 @dataclass(frozen=True)
@@ -69,26 +69,25 @@ class DeferredShading(ShadingModel):
     """Deferred reflection: the G-buffer of a pixel mirrors a learned environment.
 
     Attributes:
-        blend: "lerp": final = (1 - r) base + r sigmoid(environment), as in 3DGS-DR (Ye et al. 2024, Eq. 5);
-            "fresnel": final = base + r F(i) exp(environment). F is the unpolarized power reflectance of a dielectric
-            at the angle between ray and normal, so that strength can be a property of the surface.
-        local: True if Gaussians add local light to the environment's: a function of the mirrored direction for near
-            surroundings, which a distant environment cannot represent.
+        blend: "lerp" or "fresnel". "lerp" computes final = (1 - r) base + r sigmoid(environment), with the strength r,
+            as 3DGS-DR does (Ye et al. 2024, Eq. 5). "fresnel" computes final = base + r F(i) exp(environment). F is the
+            unpolarized power reflectance of a dielectric at the angle between ray and normal, so that r can be a
+            property of the surface.
+        local: True if Gaussians add local light to the light of the environment. Local light is a function of the
+            mirrored direction. It represents near surroundings, which a distant environment cannot represent.
         first_strength: reflection strength before the first step.
         strength_rate: learning rate of the strengths.
-        local_rate: learning rate of local light of degree 0; higher degrees have a twentieth of it.
-        environment_spread: first raw texels are uniform in plus or minus this.
+        local_rate: learning rate of local light of degree 0. Higher degrees have a twentieth of this rate.
+        environment_spread: largest absolute value of the first raw texels, which are uniform random numbers.
         environment_rate: learning rate of the texels.
-        environment_resolution: texels along a cube face's side.
-        rough: True: dielectrics have a roughness; False: only metals have one. Needs the blend "fresnel".
-        first_roughness: blur before the first step, in (0, 1). roughness_rate: its learning rate.
+        environment_resolution: number of texels along the side of a cube face.
+        rough: True if dielectrics have a roughness, False if only metals have one. Needs the blend "fresnel".
+        first_roughness: blur before the first step, in (0, 1).
+        roughness_rate: learning rate of the blur.
         metal: True if Gaussians can be metals, see ``shading.metal``. Needs the blend "fresnel".
         indices: True if Gaussians can have different refractive indices, which are never learned. Needs the blend
             "fresnel".
         metal_rate: learning rate of the metals' reflectance.
-
-    With the blend "fresnel" light is read from box-filtered mip levels of the radiance, at the level of a pixel's blur,
-    see ``shading.roughness``.
     """
 
     blend: Blend = "lerp"
@@ -110,10 +109,11 @@ class DeferredShading(ShadingModel):
 
     @property
     def surface(self) -> tuple[SurfaceProperty, ...]:
-        """Strength, blur, reflectance and metalness of metals, and the offset of the refractive index from the run's.
+        """Surface properties of the model.
 
-        The blur needs ``rough`` or ``metal``, reflectance and metalness need ``metal``, the offset needs ``indices``.
-        The native pass reads metalness behind the reflectance.
+        They are the strength, the blur (with ``rough`` or ``metal``), reflectance and metalness (with ``metal``), and
+        the offset of the refractive index (with ``indices``). The native pass expects metalness directly after the
+        reflectance.
         """
         minimum = float(torch.logit(torch.tensor(RESET_STRENGTH, dtype=torch.float64)))
         rows = [
@@ -151,7 +151,7 @@ class DeferredShading(ShadingModel):
 
     @property
     def parameters(self) -> Mapping[str, Parameter]:
-        """Parameters of the surface properties; with ``local`` harmonics of the mirrored direction."""
+        """Parameters of the surface properties and, with ``local``, of the local light."""
         own = {**super().parameters}
         if self.local:
             own["local_dc"] = Parameter((3,), self.local_rate)
@@ -167,14 +167,14 @@ class DeferredShading(ShadingModel):
     def initialize(
         self, colors: Tensor, far: Tensor, generator: torch.Generator
     ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-        """Return the same surface for all Gaussians, zero local light, and uniform random texels."""
+        """Return initial values: the same surface for all Gaussians, no local light, and uniform random texels."""
         first, _ = super().initialize(colors, far, generator)
         uniform = torch.rand(self.light_parameters["texels"].shape, generator=generator) * 2 - 1
         return first, {"texels": uniform * self.environment_spread}
 
     @property
     def layers(self) -> tuple[str, ...]:
-        """All layers; ``metalness`` only with ``metal``, ``roughness`` only if surfaces can be rough."""
+        """Names of all layers. ``metalness`` requires ``metal``, and ``roughness`` requires surfaces that can be rough."""
         absent = {"metalness": not self.metal, "roughness": not self.blurs}
         return tuple(name for name in LAYERS if not absent.get(name))
 
@@ -185,7 +185,7 @@ class DeferredShading(ShadingModel):
         )
 
     def raw_texels(self, radiance: Tensor) -> Tensor:
-        """Return the inverse of ``radiance``, which is below 1 for "lerp" and below e^5 for "fresnel"."""
+        """Return the raw texel values of a radiance, which is below 1 for "lerp" and below e^5 for "fresnel"."""
         if self.blend == "lerp":
             return torch.logit(radiance.clamp(_NO_LIGHT, 1 - _NO_LIGHT))
         return torch.log(radiance.clamp(min=_NO_LIGHT)).clamp(max=MAXIMUM_LOG_LIGHT)
@@ -196,7 +196,11 @@ class DeferredShading(ShadingModel):
         return RadianceCubemap("texels", self.radiance, self.raw_texels, LOCAL_NOTE if self.local else "")
 
     def light_levels(self, texels: Tensor, *, rough: bool) -> list[Tensor]:
-        """Return mip levels of the radiance, for mirrors the first alone; for "lerp" the raw texels."""
+        """Return the levels of light that the look-up needs.
+
+        With "fresnel" these are mip levels of the radiance, or only the first level if all surfaces are mirrors. With
+        "lerp" these are the raw texels.
+        """
         if self.blend == "lerp":
             return [texels]
         return light_levels(self.radiance(texels)) if rough else [self.radiance(texels)]
@@ -212,9 +216,11 @@ class DeferredShading(ShadingModel):
         """Return specular and diffuse contributions [..., 3].
 
         Args:
-            base: [..., 3]. strength: [..., 1] in [0, 1]. light: [..., 3] from the mirrored direction.
-            cosine: [..., 1] of the angle between the ray and the normal, in [0, 1].
-            index: refractive index, a number or [..., 1]; None: the index of the run.
+            base: [..., 3] base color.
+            strength: [..., 1] reflection strength in [0, 1].
+            light: [..., 3] light from the mirrored direction.
+            cosine: [..., 1] cosine of the angle between the ray and the normal, in [0, 1].
+            index: refractive index, a number or [..., 1]. None means the index of the run.
         """
         if self.blend == "lerp":
             return strength * light, (1 - strength) * base
@@ -222,7 +228,7 @@ class DeferredShading(ShadingModel):
         return strength * (0.5 * (s + p)) * light, base
 
     def channels(self, gaussians: Parameters, center: Tensor, degree: int) -> Channels:
-        """Return base color, ``strength``, with ``local`` the local light, and the other surface properties."""
+        """Return the channels to splat: base color, surface properties and, with ``local``, the local light."""
         others = (row for row in self.surface if row.name != "strength")
         further = surface_channels(others, gaussians)
         return Channels(
@@ -235,11 +241,13 @@ class DeferredShading(ShadingModel):
         )
 
     def shade(self, splatted: GBuffer, light: Light, camera: Camera) -> dict[str, Any]:
-        """Return ``final``, ``specular``, ``diffuse`` and ``reflection`` [H, W, 3], and ``strength`` [H, W].
+        """Shade a splatted picture, and return its layers by name.
 
-        With blur also ``roughness`` [H, W]. With ``metal`` also ``metalness`` [H, W]; if a Gaussian is a metal,
-        ``metal`` and ``reflectance`` [H, W, 3]. With several refractive indices also ``index`` [H, W]. Surface
-        properties of derived classes have layers of their names, [H, W] or [H, W, C].
+        All pictures have ``final``, ``specular``, ``diffuse`` and ``reflection`` [H, W, 3], and ``strength`` [H, W].
+        ``roughness`` [H, W] is added if surfaces can be rough. ``metalness`` [H, W] is added with ``metal``. ``metal``
+        and ``reflectance`` [H, W, 3] are added if a Gaussian is a metal. ``index`` [H, W] is added if there are several
+        refractive indices. Surface properties that derived classes add become layers with the same names, [H, W] or [H,
+        W, C].
         """
         layout = splatted.layout
         texels = light["texels"]
@@ -273,7 +281,7 @@ class DeferredShading(ShadingModel):
         return self.refractive_index + splatted["index"][..., 0].detach()
 
     def _shade_reference(self, splatted: GBuffer, texels: Tensor, camera: Camera) -> dict[str, Any]:
-        """Return the layers of ``shade_native``, computed by the reference implementations."""
+        """Compute the layers of ``shade_native`` by the reference implementations."""
         layers = self.reflect(
             splatted["color"],
             splatted["normal"],
@@ -308,14 +316,19 @@ class DeferredShading(ShadingModel):
         index: Tensor | None = None,
         level: Tensor | None = None,
     ) -> dict[str, Tensor]:
-        """Shade dielectrics per pixel: the reference implementation of ``reflect_native``, any dtype and device.
+        """Shade dielectrics per pixel.
+
+        This is the reference implementation of ``reflect_native``, for any dtype and device.
 
         Args:
-            base: [H, W, 3]. normal: [H, W, 3] world, any length. strength: [H, W]. texels: [6, R, R, 3] raw.
+            base: [H, W, 3] blended base color.
+            normal: [H, W, 3] blended normal, world axes, any length.
+            strength: [H, W] blended reflection strength.
+            texels: [6, R, R, 3] raw texels of the environment.
             camera: camera of the picture.
-            local: [H, W, 3] blended local light, added to the environment's.
-            index: [H, W] refractive index; None: the index of the run.
-            level: [H, W] mip level of the environment; None: all surfaces are mirrors.
+            local: [H, W, 3] blended local light, which is added to the light of the environment.
+            index: [H, W] refractive index. None means the index of the run.
+            level: [H, W] mip level of the environment. None means that all surfaces are mirrors.
 
         Returns:
             ``final``, ``specular``, ``diffuse`` and ``reflection``, each [H, W, 3].

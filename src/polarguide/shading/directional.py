@@ -1,7 +1,7 @@
-"""Directional factorization (Ref-GS, Zhang et al. 2025), deferred: light of a learned grid of feature vectors.
+"""Deferred shading by directional factorization (Ref-GS, Zhang et al. 2025), with a grid of learned feature vectors.
 
-One alpha blend splats albedo (3), normal (3), roughness (1) and a feature (4). With ``w`` the view ray mirrored at the
-blended normal and ``r`` the roughness, a pixel has
+Splatted channels are albedo (3), normal (3), roughness (1) and a feature vector (4). With ``w`` the view ray mirrored
+at the blended normal and ``r`` the roughness, a pixel has
 
     h = grid(w, level = L r)
     specular = exp(min(MLP(h, h x f), 5))
@@ -11,9 +11,10 @@ in linear radiance. The grid is a learned cubemap of 16 channels with L box-filt
 unit length, and h x f an outer product of 64 values. The MLP has two hidden layers with ReLU. The albedo is independent
 of the view.
 
-Surroundings do not reflect. A Gaussian that started farther away than the cameras (``surface`` 0) splats its harmonics
-instead of the albedo. Specular light of a pixel is multiplied by the share of its alpha from Gaussians with a surface.
-(For real scenes the release separates both by a sphere that the user specifies.)
+Surroundings do not reflect. A Gaussian that started farther away than the cameras has a ``surface`` of 0, and splats
+the color of its harmonics instead of the albedo. Specular light of a pixel is multiplied by the share of its alpha that
+Gaussians with a ``surface`` of 1 contribute. (For real scenes, the release separates both by a sphere that the user
+specifies.)
 """
 
 from __future__ import annotations
@@ -54,7 +55,7 @@ ALBEDO_SCALE = 0.2
 MINIMUM_ALPHA = 0.05
 """Alpha of a pixel below which it has no specular light."""
 _DARKEST = 1e-3
-"""First albedo of a black point, so that its logarithm is finite."""
+"""Least initial albedo, so that the logarithm of a black point is finite."""
 
 
 def albedo_of(gaussians: Parameters) -> Tensor:
@@ -64,18 +65,19 @@ def albedo_of(gaussians: Parameters) -> Tensor:
 
 @dataclass(frozen=True)
 class DirectionalShading(ShadingModel):
-    """Light of a learned grid of feature vectors that a small network reads; see the module.
+    """Shading model in which a small network converts learned feature vectors to reflected light; see the module.
 
     Attributes:
         width: width of the MLP's two hidden layers.
         mlp_rate: learning rate of the MLP.
-        albedo_rate: learning rate of the albedo. feature_rate: learning rate of roughness and features.
-        first_albedo: first albedo as a share of the first points' colors, in (0, 1].
+        albedo_rate: learning rate of the albedo.
+        feature_rate: learning rate of roughness and features.
+        first_albedo: initial albedo as a share of the colors of the initial points, in (0, 1].
         first_roughness: roughness before the first step, in (0, 1).
         first_light: specular radiance before the first step; its logarithm is the output bias of the MLP.
-        environment_spread: first texels of the grid are uniform in plus or minus this.
+        environment_spread: largest absolute value of the initial texels, which are uniform random numbers.
         environment_rate: learning rate of the texels.
-        environment_resolution: texels along a cube face's side, a power of two.
+        environment_resolution: number of texels along the side of a cube face, a power of two.
     """
 
     width: int = 256
@@ -93,7 +95,10 @@ class DirectionalShading(ShadingModel):
 
     @property
     def parameters(self) -> Mapping[str, Parameter]:
-        """``log_albedo`` [N, 3], ``roughness_logits`` [N], ``features`` [N, 4]; ``surface`` [N], 1 or 0, fixed."""
+        """Per-Gaussian tensors: ``log_albedo`` [N, 3], ``roughness_logits`` [N], ``features`` [N, 4], ``surface`` [N].
+
+        ``surface`` is 0 or 1, and it is not trained.
+        """
         return {
             "log_albedo": Parameter((3,), self.albedo_rate),
             "roughness_logits": Parameter((), self.feature_rate),
@@ -103,7 +108,11 @@ class DirectionalShading(ShadingModel):
 
     @property
     def light_parameters(self) -> Mapping[str, Parameter]:
-        """``texels`` [6, R, R, 16], and ``mlp_weight_K`` [inputs, outputs], ``mlp_bias_K`` [outputs], K = 0, 1, 2."""
+        """Parameters of the grid and of the MLP.
+
+        The grid has ``texels`` [6, R, R, 16]. Layer K = 0, 1, 2 of the MLP has ``mlp_weight_K`` [inputs, outputs] and
+        ``mlp_bias_K`` [outputs].
+        """
         side = self.environment_resolution
         table = {"texels": Parameter((6, side, side, CHANNELS), self.environment_rate)}
         for layer, (inputs, outputs) in enumerate(pairwise((INPUTS, self.width, self.width, 3))):
@@ -114,9 +123,11 @@ class DirectionalShading(ShadingModel):
     def initialize(
         self, colors: Tensor, far: Tensor, generator: torch.Generator
     ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-        """Return albedo from the colors, one roughness, random features, and a surface unless a position is ``far``.
+        """Return the initial values of all parameters.
 
-        The light has uniform texels, and the MLP is uniform within 1 / sqrt(inputs) like ``torch.nn.Linear``.
+        The albedo follows from the colors. All Gaussians have the same roughness, and their features are random.
+        ``surface`` is 1 unless a Gaussian is ``far``. The texels are uniform random numbers. Weights of the MLP are
+        uniform within 1 / sqrt(inputs), as in ``torch.nn.Linear``.
         """
         count = colors.shape[0]
         albedo = (self.first_albedo * colors).clamp(min=_DARKEST)
@@ -141,13 +152,13 @@ class DirectionalShading(ShadingModel):
         return first, values
 
     def radiance(self, light: Light, directions: Tensor, roughness: Tensor, features: Tensor) -> Tensor:
-        """Return the specular radiance [P, 3], in (0, e^5].
+        """Return the specular radiance [P, 3], with values in (0, e^5].
 
         Args:
             light: the parameters in ``light_parameters``.
             directions: [P, 3] mirrored rays, of any length.
-            roughness: [P] in [0, 1]; values of at least ``1 - 1 / L`` with L mip levels read the mean of the grid.
-            features: [P, 4] of any length; with zero length they have no effect.
+            roughness: [P] in [0, 1]. With L mip levels, values of at least ``1 - 1 / L`` read the mean of the grid.
+            features: [P, 4] feature vectors of any length. Vectors of zero length have no effect.
         """
         levels = box_mips(light["texels"])
         looked_up = mip_lookup(levels, directions, len(levels) * roughness)
@@ -161,9 +172,10 @@ class DirectionalShading(ShadingModel):
         return out.clamp(max=MAXIMUM_LOG_LIGHT).exp()
 
     def channels(self, gaussians: Parameters, center: Tensor, degree: int) -> Channels:
-        """Return albedo, or harmonics without a surface, as color; ``blur``, ``feature`` and ``surface``.
+        """Return the channels to splat: color, ``blur``, ``feature`` and ``surface``.
 
-        Without a surface the latter three are 0.
+        The color is the albedo. For Gaussians with a ``surface`` of 0, the color is the color of the harmonics, and the
+        other channels are 0.
         """
         surface = gaussians["surface"].detach()[:, None]
         colors = torch.where(surface > 0, albedo_of(gaussians), base_colors(gaussians, center, degree))
@@ -175,7 +187,9 @@ class DirectionalShading(ShadingModel):
         return Channels(colors, further=further)
 
     def shade(self, splatted: GBuffer, light: Light, camera: Camera) -> dict[str, Tensor]:
-        """Return ``final``, ``specular`` and ``diffuse`` [H, W, 3]; the splatted color is the diffuse layer."""
+        """Return the layers ``final``, ``specular`` and ``diffuse``, each [H, W, 3]. The splatted color is the diffuse
+        layer.
+        """
         albedo = splatted["color"]
         alpha = splatted.alpha
         rays = camera.world_rays(dtype=albedo.dtype, device=albedo.device)

@@ -1,7 +1,7 @@
-"""Rendering: features of the Gaussians, one splat of the G-buffer, then the shading model per pixel.
+"""Rendering in three steps: features of the Gaussians, splatting to a G-buffer, and shading per pixel.
 
-On the CPU in float32 one native pass in each direction computes the features of Gaussians from ``Channels``; other
-tensors use plain torch.
+In float32 on the CPU, a native pass computes the features of Gaussians from ``Channels``, and another pass their
+gradients. Other tensors use plain torch.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from polarguide.shading.result import NORMAL_CHANNELS, ChannelSlices, RenderResu
 
 
 def splats(gaussians: Parameters, features: Tensor | None = None) -> Splats:
-    """Return the input of a rasterizer, with features [N, D]; by default one feature that is zero."""
+    """Return the input of a rasterizer, with features [N, D]. By default, there is one feature that is zero."""
     means = gaussians["means"]
     return Splats(
         means,
@@ -49,20 +49,23 @@ def splatting(
     depth: bool,
     native: bool = True,
 ) -> tuple[Splats, ChannelSlices]:
-    """Return the input of a rasterizer for a shading model, and the features by name.
+    """Return the input of a rasterizer for a shading model, and the places of its features by name.
 
-    Features are the color [N, 3], with ``normals`` unit normals (``shortest_axis_normals``) in world axes [N, 3],
-    further channels of the model, and with ``depth`` the camera depth [N, 1].
+    The features of a Gaussian are the color (3), the unit normal in world axes (3), channels of the model, and the
+    camera depth (1). Normal and depth are optional.
 
     Args:
-        gaussians: Gaussians with the parameters of the shading model; with ``outward`` if normals point to the side of
-            the cameras that see them.
-        camera: the view. shading: the shading model.
-        sh_degree: degree of the base color's harmonics, 0 to 3. normals, depth: whether to splat these features.
-        native: False: the reference implementation in plain torch, any dtype and device.
+        gaussians: Gaussians with the parameters of the shading model. If they have the tensor ``outward``, normals
+            point to the side from which training views see them.
+        camera: the view.
+        shading: the shading model.
+        sh_degree: degree of the base color's harmonics, 0 to 3.
+        normals, depth: True to splat these features.
+        native: False to use the reference implementation in plain torch, for any dtype and device.
 
     Returns:
-        Differentiable in the Gaussians. The number of threads does not change a bit.
+        A tuple of the input and the slices of the features by name. The input is differentiable in the Gaussians and
+        does not depend on the number of threads.
 
     Raises:
         ValueError: the degree or a shape does not fit.
@@ -103,9 +106,9 @@ _INPUTS = (
     "metalness",
     "further",
 )
-"""Tensors of the native pass by the names of its arguments, in the order of ``_Splatting``."""
+"""Names of the tensors that the native pass reads, in the order of the arguments of ``_Splatting``."""
 _UNTRAINED = ("outward", "metalness")
-"""Tensors of the native pass without a gradient."""
+"""Names of the tensors without a gradient in the native pass."""
 
 
 class _Splatting(torch.autograd.Function):
@@ -149,23 +152,23 @@ class _Splatting(torch.autograd.Function):
 
 
 NO_LIGHT: Light = MappingProxyType({})
-"""Light of a model without parameters of the light."""
+"""Light of a shading model that learns no light."""
 
 
 @dataclass(frozen=True, eq=False)
 class RenderRequest:
-    """Layers requested from a rendering.
+    """Layers that are requested from a rendering.
 
     Attributes:
         sh_degree: SH degree of the base color, 0 to 3.
-        normals: the blended normal; a shading model that reflects always has it.
-        depth: the camera depth.
-        layers_detached: a second copy of the layers, without a gradient on the normals.
-        normal_rotation_only: a second copy of the blended normal. Its gradient rotates Gaussians and leaves
-            their position and opacity unchanged.
-        at_median_depth: normal and depth describe the surface at each pixel's median depth, without gradients. Shading
-            still uses the blended normal.
-        statistic: see ``ScreenStatistic``.
+        normals: True to render the blended normal. Shading models that reflect always render it.
+        depth: True to render the camera depth.
+        layers_detached: True to also return a copy of the layers without a gradient on the normals.
+        normal_rotation_only: True to also return a copy of the blended normal whose gradient only rotates Gaussians.
+            Their positions and opacities do not change.
+        at_median_depth: True if normal and depth describe the surface at each pixel's median depth, without gradients.
+            Shading still uses the blended normal.
+        statistic: object in which the backward pass stores the gradient of the projected means.
     """
 
     sh_degree: int = 3
@@ -190,13 +193,15 @@ def render(
     """Render one view.
 
     Args:
-        gaussians: Gaussians with the parameters of the shading model; with ``outward`` if normals point to the side of
-            the cameras that see them instead of the camera of the view.
-        camera: the view. rasterize: rasterizer of the backend.
+        gaussians: Gaussians with the parameters of the shading model. If they have the tensor ``outward``, normals
+            point to the side from which training views see them. Otherwise they point to the camera of the view.
+        camera: the view.
+        rasterize: rasterizer of the backend.
         request: requested layers.
-        shading: the shading model. light: its learned light by name.
-        footprints: [N] pixel sizes of the training, which keep larger pictures smooth, see ``raster.magnification``;
-            None: Gaussians are drawn without additional blur, as in a training.
+        shading: the shading model.
+        light: learned light of the shading model by name.
+        footprints: [N] pixel sizes of the training, which keep magnified pictures smooth, see ``raster.magnification``.
+            With None, Gaussians are drawn without additional blur, as in a training.
     """
     normals = request.normals or shading.reflects
     depth = request.depth
@@ -237,10 +242,10 @@ def render(
 def shaded(
     shading: ShadingModel, splatted: GBuffer, light: Light, camera: Camera, *, native: bool = True
 ) -> dict[str, Any]:
-    """Return the layers of a shading model, and the ``DETACHED`` ones if the G-buffer requests them.
+    """Return the layers of a shading model, with the layers in ``DETACHED`` if the G-buffer requests them.
 
-    If the model does not return these or ``native`` is False, it shades a second time with detached normals. Metals
-    keep their gradient on the normals.
+    If the model does not return the detached layers, or if ``native`` is False, it shades a second time with detached
+    normals. Light from metals keeps its gradient on the normals.
     """
     layers = {**shading.shade(replace(splatted, detached=splatted.detached and native), light, camera)}
     if not splatted.detached or "specular" not in layers or DETACHED[0] in layers:
@@ -255,9 +260,10 @@ Split = tuple[Tensor, Tensor | None, Tensor | None]
 
 
 def split(features: Tensor, alpha: Tensor, layout: ChannelSlices) -> Split:
-    """Split normal and depth from a G-buffer; ``split_reference`` or, on the CPU in float32, a native pass.
+    """Extract the normal and the depth from a G-buffer.
 
-    Without a gradient and a depth a slice of the features suffices.
+    In float32 on the CPU this is a native pass, and otherwise ``split_reference``. If there is no gradient and no
+    depth, a slice of the features suffices.
     """
     depth = "depth" in layout
     further = features.shape[-1] > 6
@@ -267,10 +273,15 @@ def split(features: Tensor, alpha: Tensor, layout: ChannelSlices) -> Split:
 
 
 def split_reference(features: Tensor, alpha: Tensor, layout: ChannelSlices) -> Split:
-    """Return features for the shading model, blended normal [H, W, 3] and camera depth [H, W]; any dtype and device.
+    """Extract the normal and the depth from a G-buffer, for any dtype and device.
 
     Args:
-        features: [H, W, D] blended; the depth is multiplied by alpha. alpha: [H, W]. layout: features by name.
+        features: [H, W, D] blended features. The blended depth is multiplied by alpha.
+        alpha: [H, W] blended opacity.
+        layout: slices of the features by name.
+
+    Returns:
+        A tuple of the features for the shading model, the blended normal [H, W, 3], and the camera depth [H, W].
     """
     normal = features[..., layout["normal"]] if "normal" in layout else None
     if "depth" not in layout:
@@ -279,7 +290,7 @@ def split_reference(features: Tensor, alpha: Tensor, layout: ChannelSlices) -> S
 
 
 class _RayCamera(Camera):
-    """Camera whose picture is one column of pixels with given rays."""
+    """Camera with given rays, whose picture is a single column of pixels."""
 
     def __init__(self, rays: Tensor) -> None:
         rotation = torch.eye(3, dtype=torch.float64)
@@ -295,7 +306,10 @@ class _RayCamera(Camera):
 def _values_along(
     gaussians: Parameters, shading: ShadingModel, rays: Tensor, normals: Tensor
 ) -> dict[str, Tensor]:
-    """Return the channels of Gaussians by name, each seen along its own ray: from the origin, with its ray as mean."""
+    """Return the channels of Gaussians by name, where each Gaussian is seen along its own ray.
+
+    For this, the camera is at the origin, and the ray is used as the position of the Gaussian.
+    """
     names = (*CORE_SHAPES, *shading.parameters)
     tensors = {name: values for name in names if (values := gaussians.get(name)) is not None}
     tensors["means"] = rays
@@ -306,14 +320,15 @@ def _values_along(
 def single_colors(
     gaussians: Parameters, light: Light, shading: ShadingModel, rays: Tensor, normals: Tensor
 ) -> Tensor:
-    """Shade Gaussians one by one.
+    """Shade each Gaussian alone, without blending.
 
     Args:
         gaussians, light, shading: the Gaussians, the light and the shading model.
-        rays: [N, 3] unit. normals: [N, 3] unit, facing the rays.
+        rays: [N, 3] unit direction from the camera to each Gaussian.
+        normals: [N, 3] unit normals that face the camera.
 
     Returns:
-        [N, 3] linear colors.
+        Linear colors [N, 3].
     """
     values = _values_along(gaussians, shading, rays, normals)
     order = ("color", "normal", *(name for name in values if name not in ("color", "normal")))

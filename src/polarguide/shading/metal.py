@@ -1,19 +1,19 @@
 """Metals in the deferred shading model.
 
-A Gaussian has a ``metalness`` of 1 (metal) or 0 (dielectric). ``training.metals`` or masks decide it; it is never
-learned. Before the last decision it can be a mixture of both. A metal has no diffuse reflection: its base color and
-its strength do not count. Its reflection is
+A Gaussian has a ``metalness`` of 1 (metal) or 0 (dielectric). It is not learned, but set by ``training.metals`` or by
+labels. Until the last decision, a Gaussian can also be a mixture of both. A metal has no diffuse reflection, so its
+base color and strength have no effect. Its reflection is
 
     specular = R(r, i) L
 
-with R of a conductor (``optics.conductor``) of reflectance r at normal incidence per color, and L the same mirrored
-light as for a dielectric. ``metalness`` and the reflectance times ``metalness`` are blended. A pixel that metals share
-with dielectrics is the sum of both.
+R is the reflectance of a conductor (``optics.conductor``) for each color, with reflectance r at normal incidence. L is
+the same mirrored light as for a dielectric. ``metalness`` and the product of reflectance and ``metalness`` are blended.
+In a pixel with metals and dielectrics, the contributions of both are added.
 
-``convert`` turns Gaussians into metals or back into dielectrics. ``mirror_base`` then gives a new metal local light
-that shows the previous base color in each direction. Mirroring at the Gaussian's normal maps harmonics of a degree onto
-themselves, so the base color over the reflectance becomes local light exactly. The environment's light is subtracted,
-up to the degree of the harmonics.
+``convert`` turns Gaussians into metals or back into dielectrics. ``mirror_base`` then gives each new metal a local
+light with which it looks like the previous base color from each direction. This conversion is exact, because a
+reflection at the Gaussian's normal maps harmonics of a degree to harmonics of the same degree. The light of the
+environment is subtracted, up to the degree of the harmonics.
 """
 
 from __future__ import annotations
@@ -44,12 +44,12 @@ MINIMUM_SHARE = 0.01
 
 
 def reflectance(logits: Tensor) -> Tensor:
-    """Return the reflectance at normal incidence of its parameter, within the range of metals."""
+    """Convert the learned parameter to the reflectance at normal incidence, within the range of metals."""
     return LEAST + (LARGEST_REFLECTANCE - LEAST) * torch.sigmoid(logits)
 
 
 def reflectance_logits(values: Tensor) -> Tensor:
-    """Return the inverse of ``reflectance``; values outside its range or at its ends are clamped to just inside."""
+    """Convert reflectances to the learned parameter. Values are first clamped to the interior of the range of metals."""
     return torch.logit(((values - LEAST) / (LARGEST_REFLECTANCE - LEAST)).clamp(0.02, 0.98))
 
 
@@ -57,17 +57,22 @@ def where_metal(features: Tensor, first: int) -> Tensor:
     """Return the indices [K] of pixels that show metal, ascending.
 
     Args:
-        features: [P, C] blended. first: first of four channels, reflectance times metalness and metalness.
+        features: [P, C] blended features.
+        first: index of the first of four channels, which are reflectance times metalness (3) and metalness (1).
     """
     return (features[:, first + 3].detach() > MINIMUM_SHARE).nonzero()[:, 0]
 
 
 def metal_pixels(features: Tensor, first: int, rays: Tensor, normal: Tensor, light: Tensor) -> MetalPixels:
-    """Shade the pixels that show metal: the reference implementation of metals in ``reflect_native``.
+    """Shade the pixels that show metal.
+
+    This is the reference implementation of metals in ``reflect_native``.
 
     Args:
-        features: [P, C] blended. first: first channel of metals, see ``where_metal``.
-        rays: [P, 3] unit, world. normal: [P, 3] blended, world.
+        features: [P, C] blended features.
+        first: index of the first channel of metals, see ``where_metal``.
+        rays: [P, 3] unit rays, world axes.
+        normal: [P, 3] blended normals, world axes.
         light: [P, 3] mirrored light.
     """
     pixels = where_metal(features, first)
@@ -83,7 +88,7 @@ def metal_pixels(features: Tensor, first: int, rays: Tensor, normal: Tensor, lig
 
 
 def with_metal(layers: Mapping[str, Any], metal: MetalPixels) -> dict[str, Any]:
-    """Return layers [H, W, 3] of a picture with the contribution of metals."""
+    """Add the contribution of metals to the layers [H, W, 3] of a picture."""
     sums = {
         name: layers[name].flatten(0, 1).index_add(0, metal.pixels, metal.specular).view_as(layers[name])
         for name in ("final", "specular")
@@ -92,7 +97,7 @@ def with_metal(layers: Mapping[str, Any], metal: MetalPixels) -> dict[str, Any]:
 
 
 def metalness_picture(metal: MetalPixels | None, like: Tensor) -> Tensor:
-    """Return the blended metalness [H, W] of a picture of the size of ``like`` [H, W, ...]."""
+    """Return the blended metalness [H, W] of a picture, in the size of ``like`` [H, W, ...]."""
     empty = like.new_zeros(like.shape[0] * like.shape[1])
     if metal is not None:
         empty = empty.index_copy(0, metal.pixels, metal.share.detach())
@@ -102,11 +107,13 @@ def metalness_picture(metal: MetalPixels | None, like: Tensor) -> Tensor:
 def layer_stokes(result: RenderResult, camera: Camera, refractive_index: float) -> Tensor:
     """Predict Stokes vectors [3, H, W, 3] of a picture of smooth dielectrics and metals.
 
-    Light from metals has their degree of polarization, other light the degree of a dielectric's lobes.
+    Light from metals has the degree of polarization of metals. All other light has the degree of polarization of the
+    specular or diffuse lobe of a dielectric.
 
     Args:
-        result: picture with the specular and diffuse layers and the normal. camera: camera of the picture.
-        refractive_index: refractive index of the run, for pictures without an ``index``.
+        result: picture with the specular and diffuse layers and the normal.
+        camera: camera of the picture.
+        refractive_index: refractive index of the run, for pictures without the layer ``index``.
     """
     normal = result.shaded_normal
     facing = camera.to_camera(normal)
@@ -133,7 +140,7 @@ def layer_stokes(result: RenderResult, camera: Camera, refractive_index: float) 
 
 
 MOST_STRENGTH = 0.98
-"""Upper bound of strengths after the light became brighter."""
+"""Upper bound of strengths after the light has been made brighter."""
 DIRECTIONS = 128
 """Number of directions in which base color and mirrored light are compared."""
 CHUNK = 4096
@@ -152,9 +159,11 @@ def become_metal(
 
     Args:
         gaussians: the Gaussians, changed in place.
-        texels: [6, R, R, 3] raw light from afar, changed in place. radiance: function from raw values to radiance.
-        metalness: [N], 0 to 1. reflectances: [N, 3] at normal incidence, first values of new metals.
-        gain: function that returns a factor on all light; called when the first metals appear.
+        texels: [6, R, R, 3] raw texels of the environment, changed in place.
+        radiance: function from raw values to radiance.
+        metalness: [N] new metalness, 0 to 1.
+        reflectances: [N, 3] reflectances at normal incidence, with which new metals start.
+        gain: function that returns a factor on all light. It is called when the first metals appear.
     """
     first = not any_nonzero(gaussians, "metalness")
     fresh = convert(gaussians, metalness, reflectances)
@@ -170,15 +179,16 @@ def become_metal(
 def convert(gaussians: Gaussians, metalness: Tensor, reflectances: Tensor) -> Tensor:
     """Set the metalness of Gaussians.
 
-    Converted Gaussians start with zero local light. Base color and strength are unchanged, so a metal that becomes a
-    dielectric again has its previous ones.
+    Converted Gaussians start without local light. Base color and strength do not change, so that a metal can become the
+    same dielectric again.
 
     Args:
         gaussians: the Gaussians, changed in place.
-        metalness: [N], 0 to 1. reflectances: [N, 3] at normal incidence, for new metals.
+        metalness: [N] new metalness, 0 to 1.
+        reflectances: [N, 3] reflectances of new metals at normal incidence.
 
     Returns:
-        [N] bool, the new metals.
+        Mask [N], True for new metals.
     """
     changed = (metalness > 0) != (gaussians["metalness"] > 0)
     fresh = (metalness > 0) & changed
@@ -201,7 +211,8 @@ def scale_light(gaussians: Gaussians, texels: Tensor, gain: float) -> None:
 
     Args:
         gaussians: the Gaussians, changed in place.
-        texels: logarithms of radiance, changed in place. gain: factor; 1 changes nothing.
+        texels: logarithms of radiance, changed in place.
+        gain: the factor; 1 changes nothing.
     """
     if gain == 1:
         return
@@ -216,11 +227,13 @@ def scale_light(gaussians: Gaussians, texels: Tensor, gain: float) -> None:
 def mirror_base(
     gaussians: Gaussians, texels: Tensor, fresh: Tensor, radiance: Callable[[Tensor], Tensor]
 ) -> None:
-    """Give new metals the local light that leaves their look unchanged; see the module.
+    """Give new metals a local light that does not change their look; see the module.
 
     Args:
         gaussians: the Gaussians, changed in place.
-        texels: [6, R, R, 3] raw. fresh: [N] bool, the new metals. radiance: function from raw values to radiance.
+        texels: [6, R, R, 3] raw texels of the environment.
+        fresh: [N] bool, True for new metals.
+        radiance: function from raw values to radiance.
     """
     means = gaussians["means"]
     toward = spread_directions(DIRECTIONS).to(means)

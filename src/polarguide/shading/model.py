@@ -1,7 +1,7 @@
-"""Interface of shading models: how a picture is made from Gaussians and learned light.
+"""Interface of shading models, which compute a picture from Gaussians and learned light.
 
-A recipe holds one shading model. Everything that depends on the reflection of light is a member of it. Training,
-rendering, the viewer and the exports use these members, so a new model is one new class.
+A recipe has one shading model. All computations that depend on the reflection of light are members of its class.
+Training, rendering, the viewer and the exports use these members. A new shading model is therefore a single new class.
 """
 
 from __future__ import annotations
@@ -38,14 +38,17 @@ Model = TypeVar("Model", bound="ShadingModel")
 
 
 class Channels(NamedTuple):
-    """Splatted channels of Gaussians. All but ``color`` and ``further`` are parameters, which a native pass evaluates.
+    """Channels of Gaussians that are splatted to a G-buffer.
+
+    All attributes except ``color`` and ``further`` are parameters, from which a native pass computes the channels.
 
     Attributes:
-        color: [N, 3] linear color; None: the harmonics of the base color. A color needs the reference implementation.
+        color: [N, 3] linear color. With None, the harmonics of the base color are evaluated. A color requires the
+            reference implementation.
         strength_logits: [N] raw reflection strength.
-        light_dc, light_rest: [N, 3] and [N, 15, 3] harmonics of the mirrored direction: local light.
+        light_dc, light_rest: [N, 3] and [N, 15, 3] harmonics of the local light, a function of the mirrored direction.
         metalness: [N] in [0, 1], without a gradient. Color and strength are multiplied by 1 - metalness.
-        further: channels [N, C] by name, behind the others.
+        further: additional channels [N, C] by name, which follow the other channels.
     """
 
     color: Tensor | None = None
@@ -65,11 +68,15 @@ class Channels(NamedTuple):
     def values(
         self, gaussians: Parameters, normals: Tensor, center: Tensor, degree: int
     ) -> dict[str, Tensor]:
-        """Return the channels [N, C] by name: the reference implementation of the native pass.
+        """Return the channels [N, C] by name.
+
+        This is the reference implementation of the native pass.
 
         Args:
             gaussians: the Gaussians.
-            normals: [N, 3] unit, world axes. center: [3] of the camera. degree: degree of the harmonics, 0 to 3.
+            normals: [N, 3] unit normals, world axes.
+            center: [3] camera center.
+            degree: degree of the harmonics, 0 to 3.
         """
         color = base_colors(gaussians, center, degree) if self.color is None else self.color
         channels = {"color": color}
@@ -93,7 +100,7 @@ class GBuffer:
         features: [H, W, D] blended channels: ``color``, ``normal`` (world axes, not normalized), and others.
         alpha: [H, W].
         layout: channels by name.
-        metal: contribution of metals to the picture, if computed before.
+        metal: contribution of metals to the picture, if it was computed before.
         detached: True if ``shade`` also returns ``detached_specular`` and ``detached_diffuse``, without a gradient on
             the normals. If the model ignores it, ``gbuffer.shaded`` shades twice.
     """
@@ -117,13 +124,15 @@ class GBuffer:
 
 
 class RadianceCubemap(NamedTuple):
-    """Parameter of the light that is radiance from afar. It can be exported, turned and replaced.
+    """Parameter of the light that represents radiance from distant surroundings.
+
+    Such light can be exported, rotated and replaced.
 
     Attributes:
         name: name of the parameter, raw texels [6, R, R, 3].
         radiance: function from raw values to linear radiance, [..., 3].
         raw: inverse of ``radiance``, limited to the range of raw values.
-        note: sentences on light that does not follow when this light is turned or replaced; empty: all light follows.
+        note: text about light that does not change when this light is rotated or replaced. Empty if there is none.
     """
 
     name: str
@@ -134,9 +143,9 @@ class RadianceCubemap(NamedTuple):
 
 @dataclass(frozen=True)
 class ShadingModel(ABC):
-    """Shading of a recipe: learned parameters, splatted channels, and the picture made from them.
+    """Base class of shading models: learned parameters, splatted channels, and the computation of pictures.
 
-    Subclasses are frozen dataclasses. Their fields are part of the recipe and recorded in a run's folder. The
+    Subclasses are frozen dataclasses. Their fields are part of the recipe and are recorded in the run folder. The
     refractive index belongs to the run, see ``bind``.
 
     Attributes:
@@ -146,7 +155,7 @@ class ShadingModel(ABC):
     refractive_index: float = field(default=1.5, kw_only=True)
 
     stream: ClassVar[int] = 6
-    """Number of the random sequence of a seed from which the first values are drawn."""
+    """Index of the random stream from which initial values are drawn."""
 
     def bind(self: Model, refractive_index: float) -> Model:
         """Return a copy of the model with the refractive index of a run.
@@ -173,7 +182,9 @@ class ShadingModel(ABC):
 
     @property
     def parameters(self) -> Mapping[str, Parameter]:
-        """Per-Gaussian tensors in addition to geometry and base color; by default those of the surface properties."""
+        """Per-Gaussian tensors in addition to geometry and base color. By default, the surface properties determine
+        them.
+        """
         return {row.parameter: row.learned for row in self.surface}
 
     @property
@@ -201,40 +212,50 @@ class ShadingModel(ABC):
 
     @property
     def layers(self) -> tuple[str, ...]:
-        """Names of the layers in pictures, as in ``shading.result.LAYERS``; with "specular" if the model reflects."""
+        """Names of the layers in pictures, from ``shading.result.LAYERS``. They contain "specular" if the model
+        reflects.
+        """
         return ("final", "base", "specular", "diffuse", "normal", "depth", "alpha")
 
     def channels(self, gaussians: Parameters, center: Tensor, degree: int) -> Channels:
-        """Return the splatted channels, without normal and depth; by default base color and surface properties.
+        """Return the channels to splat, apart from normal and depth. By default, these are base color and surface
+        properties.
 
         Args:
             gaussians: the Gaussians, with the parameters of the model.
-            center: [3] of the camera. degree: degree of the base color's harmonics, 0 to 3.
+            center: [3] camera center.
+            degree: degree of the base color's harmonics, 0 to 3.
         """
         return Channels(further=surface_channels(self.surface, gaussians))
 
     @abstractmethod
     def shade(self, splatted: GBuffer, light: Light, camera: Camera) -> dict[str, Any]:
-        """Return layers by their names in ``RenderResult``, at least ``final``; ``metal`` if there are metals."""
+        """Shade a G-buffer, and return its layers by name.
+
+        The result contains at least ``final``, and ``metal`` if there are metals.
+        """
 
     def predicted_stokes(self, result: RenderResult, camera: Camera) -> Tensor:
-        """Return Stokes vectors [3, H, W, 3] of a rendered picture; by default of a smooth dielectric and metals.
+        """Predict the Stokes vectors [3, H, W, 3] of a rendered picture.
+
+        By default, surfaces are smooth dielectrics and metals.
 
         Args:
-            result: picture with the specular and diffuse layers and the normal. camera: camera of the picture.
+            result: picture with the specular and diffuse layers and the normal.
+            camera: camera of the picture.
         """
         return layer_stokes(result, camera, self.refractive_index)
 
     @property
     def radiance_cubemap(self) -> RadianceCubemap | None:
-        """Radiance from afar, for relighting and export; None if the light is no such cubemap."""
+        """Cubemap of distant light, for relighting and export. None if the model has no such cubemap."""
         return None
 
     # Derived from the members above
 
     @property
     def reflects(self) -> bool:
-        """True if pictures have a specular layer. Then normals are always splatted."""
+        """True if pictures have a specular layer. In this case, normals are always splatted."""
         return "specular" in self.layers
 
     @property

@@ -1,7 +1,7 @@
 """Native passes over the G-buffer on the CPU.
 
-Reference implementations: ``DeferredShading.reflect`` and ``metal.metal_pixels`` of ``reflect_native``,
-``gbuffer.split_reference`` of ``split_native``.
+The reference implementations of ``reflect_native`` are ``DeferredShading.reflect`` and ``metal.metal_pixels``. The
+reference implementation of ``split_native`` is ``gbuffer.split_reference``.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class MetalArguments(NamedTuple):
 
     Attributes:
         pixels: [K] int64 indices of pixels that show metal, ascending.
-        first: first of the four channels of metals.
+        first: index of the first of the four channels of metals.
         least_share: metalness of a pixel below which it is shaded as a dielectric.
     """
 
@@ -41,15 +41,15 @@ class ReflectArguments(NamedTuple):
     """Arguments of ``reflect_native`` from a shading model and its G-buffer.
 
     Attributes:
-        fresnel: True: light is radiance with Fresnel's weight. False: a lerp with the logistic function of texels.
-        local: True if channels 7 to 9 are local light, which is added to the environment's.
-        refractive_index: refractive index of Fresnel's weight.
-        index_channel: channel of the offset of the refractive index, without a gradient; -1: no such channel.
-        blur_channel: channel of the blended blur; -1: all surfaces are mirrors.
+        fresnel: True for the blend "fresnel", False for the blend "lerp", see ``DeferredShading``.
+        local: True if channels 7 to 9 are local light, which is added to the light of the environment.
+        refractive_index: refractive index in Fresnel's equations.
+        index_channel: channel of the offset of the refractive index, without a gradient. -1 means that there is none.
+        blur_channel: channel of the blended blur. -1 means that all surfaces are mirrors.
         blur: number of mip levels from a mirror to a blur of 1.
         alpha: [P] divisor of the blended blur, without a gradient.
-        metal: metals in the picture, added to ``final`` and ``specular``; None without metals.
-        detached: True: also return ``specular`` and ``diffuse`` without a gradient on the normals. Light that metals
+        metal: metals in the picture, which are added to ``final`` and ``specular``. None without metals.
+        detached: True to also return ``specular`` and ``diffuse`` without a gradient on the normals. Light that metals
             mirror keeps this gradient.
     """
 
@@ -65,7 +65,7 @@ class ReflectArguments(NamedTuple):
 
     @property
     def shading(self) -> dict[str, Any]:
-        """Arguments of the native functions for the weight of the light."""
+        """Arguments of the native functions that determine the weight of the light."""
         return {
             "fresnel": self.fresnel,
             "local": self.local,
@@ -75,7 +75,7 @@ class ReflectArguments(NamedTuple):
 
     @property
     def level(self) -> dict[str, Any]:
-        """Arguments of the native functions for the mip level of the light."""
+        """Arguments of the native functions that determine the mip level of the light."""
         return {"roughness": self.blur_channel, "blur": self.blur, "alpha": self.alpha}
 
     @property
@@ -214,16 +214,18 @@ def reflect_native(
     All tensors are float32 on the CPU.
 
     Args:
-        features: [P, D] blended base color, normal, strength and, with ``local``, light; other channels may follow.
-        rays: [P, 3] unit, world.
-        textures: mip levels of the light from afar, [6, R, R, 3] each: radiance with ``fresnel``, else one raw level.
+        features: [P, D] blended base color, normal, strength and, with ``local``, local light. Other channels may
+            follow.
+        rays: [P, 3] unit rays, world axes.
+        textures: mip levels of the environment, [6, R, R, 3] each. With ``fresnel`` they are radiance. Otherwise there
+            is one level of raw texels.
         arguments: arguments of the shading.
 
     Returns:
         ``final``, ``specular``, ``diffuse`` and ``reflection``, each [P, 3], differentiable in features and textures.
-        With ``detached`` also the two detached layers. With ``metal`` also its share [K] (no gradient), its reflected
-        light [K, 3], and its degree of polarization over ``sin^2(zenith)`` [K, 3]. The number of threads does not
-        change a bit.
+        With ``detached``, the two detached layers follow. With ``metal``, three tensors of K pixels follow: the share
+        of metal [K] without a gradient, the light that metal reflects [K, 3], and its degree of polarization over
+        ``sin^2(zenith)`` [K, 3]. Results do not depend on the number of threads.
 
     Raises:
         ValueError: a shape does not fit.
@@ -241,7 +243,7 @@ def shade_native(
     local: bool,
     refractive_index: float,
 ) -> dict[str, Any]:
-    """Return the layers of ``reflect_native`` by name, [H, W, 3] each, and ``metal``, None without metals."""
+    """Return the layers of ``reflect_native`` by name, each [H, W, 3], and ``metal``, which is None without metals."""
     layout = splatted.layout
     features = splatted.features.flatten(0, 1)
     index_channel = first_channel(layout, "index")
@@ -299,7 +301,7 @@ class _GBufferSplit(torch.autograd.Function):
 
 
 def split_native(features: Tensor, alpha: Tensor, *, depth: bool) -> tuple[Tensor, Tensor, Tensor | None]:
-    """Split the blended normal and the depth from a G-buffer, with one gradient pass for all results.
+    """Extract the blended normal and the depth from a G-buffer, with one gradient pass for all results.
 
     Args:
         features: [H, W, D] blended color, normal and at least one further channel; float32 on the CPU.
@@ -307,7 +309,7 @@ def split_native(features: Tensor, alpha: Tensor, *, depth: bool) -> tuple[Tenso
         depth: True if the last channel is the depth times alpha.
 
     Returns:
-        ``features`` for other readers, the normal [H, W, 3] and the depth [H, W] or None.
+        A tuple of ``features`` for further use, the normal [H, W, 3], and the depth [H, W] or None.
 
     Raises:
         ValueError: a shape does not fit.

@@ -1,4 +1,4 @@
-"""Render result, the same in every stage and recipe, and the channels of the G-buffer from which it is made."""
+"""Result of a rendering, in the same format for all recipes, and the channels of the G-buffer."""
 
 from __future__ import annotations
 
@@ -17,18 +17,21 @@ COLOR_CHANNELS = (0, 1, 2)
 NORMAL_CHANNELS = (3, 4, 5)
 """Channels of the normal in a G-buffer with normals."""
 ChannelSlices = Mapping[str, slice]
-"""Channels of a G-buffer by name. Their order is color, normal (if splatted), channels of the shading model, and depth
-(if splatted). The native passes rely on it."""
+"""Slices of the channels of a G-buffer by name.
+
+The order is color, normal (if splatted), channels of the shading model, and depth (if splatted). The native passes rely
+on this order.
+"""
 
 
 def channel_slices(widths: Mapping[str, int]) -> dict[str, slice]:
-    """Return the slice of each name, given the number of its channels; names are in the order of the channels."""
+    """Return the slices of channels by name, from the numbers of channels by name, in order."""
     ends = accumulate(widths.values())
     return {name: slice(end - width, end) for (name, width), end in zip(widths.items(), ends, strict=True)}
 
 
 def first_channel(channels: ChannelSlices, name: str) -> int:
-    """Return the first channel of a name; -1 without such channels."""
+    """Return the index of the first channel of a name, or -1 if the name has no channels."""
     return channels[name].start if name in channels else -1
 
 
@@ -47,8 +50,10 @@ LAYERS = (
 )
 """Names of the pictures in a ``RenderResult``."""
 POLARIZED = ("stokes", "dolp", "aolp")
-"""Names of the layers that predicted Stokes vectors add. Layers measured by a view have these names followed by
-``, measured``."""
+"""Names of the layers that a prediction of Stokes vectors adds.
+
+The corresponding layers that were measured in a view have these names followed by ``, measured``.
+"""
 
 
 class MetalPixels(NamedTuple):
@@ -132,7 +137,7 @@ class RenderResult:
         return self.layers["depth"]
 
     def __getattr__(self, name: str) -> Tensor | None:
-        """Return an optional layer, such as ``result.strength``; None if the rendering lacks it."""
+        """Return an optional layer, such as ``result.strength``, or None if the rendering lacks it."""
         if name not in LAYERS:
             raise AttributeError(f"RenderResult has no layer {name!r}")
         return self.layers.get(name)
@@ -144,7 +149,7 @@ class RenderResult:
 
     @property
     def is_polarized(self) -> bool:
-        """True if the result has both lobes and the normal, which Stokes vectors are predicted from."""
+        """True if the result has specular and diffuse layer and normal, from which Stokes vectors are predicted."""
         return {"specular", "diffuse", "normal"} <= self.layers.keys()
 
     def with_layers(self, **layers: Tensor) -> RenderResult:
@@ -165,7 +170,8 @@ def polarized_layers(stokes: Tensor) -> dict[str, Tensor]:
         stokes: [3, H, W, 3] Stokes vectors in the lens frame, as in ``View.stokes``; S0 is twice the picture.
 
     Returns:
-        ``stokes``; the ``dolp`` [H, W] in [0, 1] and the ``aolp`` [H, W] in [0, pi) radians of its luminance.
+        The layers ``stokes``, ``dolp`` [H, W] in [0, 1], and ``aolp`` [H, W] in [0, pi) radians. The latter two are
+        computed from the luminance.
     """
     luminance = optics.luminance(stokes)
     return {"stokes": stokes, "dolp": optics.dolp(luminance), "aolp": optics.aolp(luminance)}

@@ -1,8 +1,9 @@
 """Blur of reflections by mip levels of the environment, and the equivalent roughness for other renderers.
 
-The blur b of a Gaussian, in [0, 1], selects the level ``LEVELS b`` of the box-filtered radiance. A pixel has the mean blur of
-its Gaussians. A level blurs like the GGX lobe (Walter et al. 2007) whose full width at half maximum equals the width
-of the level's texels. For narrow lobes that width is 147 degrees times alpha, so with R texels along a face's side
+The blur b of a Gaussian, in [0, 1], selects the level ``LEVELS b`` of the box-filtered radiance. A pixel has the mean
+blur of its Gaussians. A level blurs like the GGX lobe (Walter et al. 2007) whose full width at half maximum equals the
+width of the level's texels. For narrow lobes that width is 147 degrees times alpha, so with R texels along a face's
+side
 
     alpha = 2^(LEVELS b) (90 degrees / R) / (147 degrees)
 

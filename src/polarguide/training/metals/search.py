@@ -373,8 +373,7 @@ def light_gain(
 
     Returns:
         The median of measured over rendered light on the first metals. It is limited to at most ``most_gain``, and to
-        at
-        least a value that keeps strengths below 1. The factor is 1 if there are no views or too few pixels of metal.
+        at least a value that keeps strengths below 1. The factor is 1 if there are no views or too few pixels of metal.
     """
     ratios = []
     pixels = 0
