@@ -44,7 +44,7 @@ class ReflectArguments(NamedTuple):
         fresnel: True for the blend "fresnel", False for the blend "lerp", see ``DeferredShading``.
         local: True if channels 7 to 9 are local light, which is added to the light of the environment.
         refractive_index: refractive index in Fresnel's equations.
-        index_channel: channel of the offset of the refractive index, without a gradient. -1 means that there is none.
+        index_channel: channel of the offset of the refractive index, without a gradient. -1 without such a channel.
         blur_channel: channel of the blended blur. -1 means that all surfaces are mirrors.
         blur: number of mip levels from a mirror to a blur of 1.
         alpha: [P] divisor of the blended blur, without a gradient.

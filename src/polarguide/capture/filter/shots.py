@@ -280,9 +280,14 @@ def find_single_shots(
 ) -> tuple[list[SingleShot], list[Path]]:
     """Find the photographs of a folder with their views and angles.
 
-    The angles are taken from the first of these sources that exists: the argument ``angles``; the table ``angles.csv``
-    in the folder; the names of the subfolders (``0``, ``30``, ``unknown``, ``none``, ...); the names of the files
-    (``cup_045.jpg``, ``cup_a30.jpg``). Files whose names differ only in the angle belong to one view. A table may state
+    The angles are taken from the first of these sources that exists:
+
+    - the argument ``angles``
+    - the table ``angles.csv`` in the folder
+    - the names of the subfolders (``0``, ``30``, ``unknown``, ``none``, ...)
+    - the names of the files (``cup_045.jpg``, ``cup_a30.jpg``)
+
+    Files whose names differ only in the angle belong to one view. A table may state
     the view of each file.
 
     Args:
