@@ -110,7 +110,7 @@ class GaussianModel:
             within: function that maps positions [N, 3] in the scene to a mask [N] of visible positions. None means all
                 are visible.
 
-            """
+        """
         gaussians: Parameters = self.state.gaussians
         footprints = self.state.footprints
         if within is not None:

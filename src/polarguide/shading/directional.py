@@ -187,8 +187,9 @@ class DirectionalShading(ShadingModel):
         return Channels(colors, further=further)
 
     def shade(self, splatted: GBuffer, light: Light, camera: Camera) -> dict[str, Tensor]:
-        """Return the layers ``final``, ``specular`` and ``diffuse``, each [H, W, 3]. The splatted color is the diffuse
-        layer.
+        """Return the layers ``final``, ``specular`` and ``diffuse``, each [H, W, 3].
+
+        The diffuse layer is the splatted color.
         """
         albedo = splatted["color"]
         alpha = splatted.alpha

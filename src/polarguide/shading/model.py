@@ -182,8 +182,9 @@ class ShadingModel(ABC):
 
     @property
     def parameters(self) -> Mapping[str, Parameter]:
-        """Per-Gaussian tensors in addition to geometry and base color. By default, the surface properties determine
-        them.
+        """Per-Gaussian tensors in addition to geometry and base color.
+
+        By default, they follow from the surface properties.
         """
         return {row.parameter: row.learned for row in self.surface}
 
@@ -212,14 +213,16 @@ class ShadingModel(ABC):
 
     @property
     def layers(self) -> tuple[str, ...]:
-        """Names of the layers in pictures, from ``shading.result.LAYERS``. They contain "specular" if the model
-        reflects.
+        """Names of the layers in pictures, from ``shading.result.LAYERS``.
+
+        They contain "specular" if the model reflects.
         """
         return ("final", "base", "specular", "diffuse", "normal", "depth", "alpha")
 
     def channels(self, gaussians: Parameters, center: Tensor, degree: int) -> Channels:
-        """Return the channels to splat, apart from normal and depth. By default, these are base color and surface
-        properties.
+        """Return the channels to splat, apart from normal and depth.
+
+        By default, these are base color and surface properties.
 
         Args:
             gaussians: the Gaussians, with the parameters of the model.
