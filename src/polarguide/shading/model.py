@@ -132,7 +132,7 @@ class RadianceCubemap(NamedTuple):
         name: name of the parameter, raw texels [6, R, R, 3].
         radiance: function from raw values to linear radiance, [..., 3].
         raw: inverse of ``radiance``, limited to the range of raw values.
-        note: text about light that does not change when this light is rotated or replaced. Empty if there is none.
+        note: text about light that does not change when this light is rotated or replaced. Empty if all light changes.
     """
 
     name: str
