@@ -269,7 +269,7 @@ def run_to_the_end(
         session: options with the number of steps between two checkpoints.
         reporter: receives progress.
         should_stop: function that returns True to end the training.
-        look: function that is called between steps, such as a viewer. None if it is missing.
+        look: function that is called between steps, such as a viewer. None means that no function is called.
         planned: memory in bytes that the process may use.
 
     Raises:

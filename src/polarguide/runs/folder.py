@@ -62,7 +62,7 @@ class RunConfiguration:
         device: device of the training.
         test_views: names of the held-out views.
         version: version of polarguide.
-        painted: hash of the painted materials of the training, see ``runs.painted``. None if they are missing.
+        painted: hash of the painted materials of the training, see ``runs.painted``. None without painted materials.
     """
 
     scene: Annotated[str, msgspec.Meta(min_length=1)]

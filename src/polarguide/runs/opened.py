@@ -135,7 +135,7 @@ class OpenedRun:
     def health(self) -> Health | None:
         """Result of the check at the end of the training.
 
-        It is None if the training is unfinished, or if its version of polarguide had no such check.
+        The value is missing (None) if the training is unfinished, or if its version of polarguide had no such check.
 
         Raises:
             PolarguideError: ``health.json`` is invalid.
@@ -146,8 +146,8 @@ class OpenedRun:
     def polarization(self) -> str:
         """Quality of the polarization data of most training views, as text.
 
-        The text begins with ``measured``, ``fitted`` or ``none``, and lists exceptions. It is ``not recorded`` if
-        ``health`` is None.
+        The text begins with ``measured``, ``fitted`` or ``none``, and lists exceptions. It is ``not recorded`` for a
+        run without ``health``.
         """
         health = self.health
         return "not recorded" if health is None else health.polarization.text

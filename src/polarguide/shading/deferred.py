@@ -174,7 +174,7 @@ class DeferredShading(ShadingModel):
 
     @property
     def layers(self) -> tuple[str, ...]:
-        """Names of all layers. ``metalness`` requires ``metal``; ``roughness`` requires surfaces that can be rough."""
+        """Names of all layers. ``metalness`` needs ``metal``, and ``roughness`` needs surfaces that can be rough."""
         absent = {"metalness": not self.metal, "roughness": not self.blurs}
         return tuple(name for name in LAYERS if not absent.get(name))
 

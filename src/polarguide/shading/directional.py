@@ -189,7 +189,7 @@ class DirectionalShading(ShadingModel):
     def shade(self, splatted: GBuffer, light: Light, camera: Camera) -> dict[str, Tensor]:
         """Return the layers ``final``, ``specular`` and ``diffuse``, each [H, W, 3].
 
-        The splatted color is the diffuse layer.
+        The diffuse layer is the splatted color.
         """
         albedo = splatted["color"]
         alpha = splatted.alpha

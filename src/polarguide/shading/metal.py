@@ -49,7 +49,7 @@ def reflectance(logits: Tensor) -> Tensor:
 
 
 def reflectance_logits(values: Tensor) -> Tensor:
-    """Convert reflectances to the learned parameter. Values are first clamped to the range of metals."""
+    """Convert reflectances to the learned parameter, after clamping them to the interior of the range of metals."""
     return torch.logit(((values - LEAST) / (LARGEST_REFLECTANCE - LEAST)).clamp(0.02, 0.98))
 
 

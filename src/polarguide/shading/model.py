@@ -132,7 +132,7 @@ class RadianceCubemap(NamedTuple):
         name: name of the parameter, raw texels [6, R, R, 3].
         radiance: function from raw values to linear radiance, [..., 3].
         raw: inverse of ``radiance``, limited to the range of raw values.
-        note: text about light that does not change when this light is rotated or replaced. Empty without such light.
+        note: text about light that does not change when this light is rotated or replaced. Empty if all light changes.
     """
 
     name: str
@@ -184,7 +184,7 @@ class ShadingModel(ABC):
     def parameters(self) -> Mapping[str, Parameter]:
         """Per-Gaussian tensors in addition to geometry and base color.
 
-        By default, the surface properties determine them.
+        By default, they follow from the surface properties.
         """
         return {row.parameter: row.learned for row in self.surface}
 

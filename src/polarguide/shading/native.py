@@ -44,7 +44,8 @@ class ReflectArguments(NamedTuple):
         fresnel: True for the blend "fresnel", False for the blend "lerp", see ``DeferredShading``.
         local: True if channels 7 to 9 are local light, which is added to the light of the environment.
         refractive_index: refractive index in Fresnel's equations.
-        index_channel: channel of the offset of the refractive index, without a gradient. -1 without such a channel.
+        index_channel: channel of the offset of the refractive index, without a gradient. -1 means that all surfaces
+        have the index of the run.
         blur_channel: channel of the blended blur. -1 means that all surfaces are mirrors.
         blur: number of mip levels from a mirror to a blur of 1.
         alpha: [P] divisor of the blended blur, without a gradient.
@@ -243,7 +244,10 @@ def shade_native(
     local: bool,
     refractive_index: float,
 ) -> dict[str, Any]:
-    """Return the layers of ``reflect_native`` by name, each [H, W, 3], and ``metal``, which is None without metals."""
+    """Return the layers of ``reflect_native`` by name, each [H, W, 3].
+
+    The entry ``metal`` holds the metals in the picture, or None without metals.
+    """
     layout = splatted.layout
     features = splatted.features.flatten(0, 1)
     index_channel = first_channel(layout, "index")

@@ -145,7 +145,7 @@ class Unguided(NamedTuple):
     """Part of a view's priors that depends on the pictures alone.
 
     It does not depend on the Gaussians, so it is computed once and reused at all refreshes. The last four attributes
-    are None unless the settings request normals from color differences.
+    have values only if the settings request normals from color differences, and None otherwise.
 
     Attributes:
         usable: [H, W] bool, True for pixels whose polarization exceeds the threshold and its noise.

@@ -112,9 +112,7 @@ def fit_angle(
     if gain <= 0 or length == 0:
         return None
     covariance = _covariance(columns, plain, y - solution @ columns, intensity.shape)
-    if (
-        mount == "filter"
-    ):  # relative to the analyzer of the previous iteration, the second component is almost 0
+    if mount == "filter":  # relative to the previous analyzer, the second component is almost 0
         x = length
         y2 = 0.0
     across = torch.tensor([0.0, -y2, x], dtype=torch.float64) / length
