@@ -220,7 +220,7 @@ def decide_pairing(residuals: NDArray[np.float64]) -> int | None:
         residuals: ``capture.checks.Measures.residuals`` of each view, [V, 3].
 
     Returns:
-        Index into ``PAIRINGS`` of the pairing whose residuals are by far the smallest. It is None if no pairing is
+        Index into ``PAIRINGS`` of the pairing whose residuals are by far the smallest. It is ``None`` if no pairing is
         clearly the best.
     """
     residuals = residuals[residuals.max(axis=1) > 0]

@@ -106,8 +106,8 @@ def combined(first: Calibration, second: Calibration) -> Calibration | None:
     """Combine two calibrations into one that has the effect of ``first`` followed by ``second``.
 
     Returns:
-        The calibration, without gains. It is None if no single calibration has this effect. This happens if ``first``
-        rotates by a fraction of 45 degrees and ``second`` changes which pictures are perpendicular.
+        The calibration, without gains. It is ``None`` if no single calibration has this effect. This happens if
+        ``first`` rotates by a fraction of 45 degrees and ``second`` changes which pictures are perpendicular.
     """
     named, turn = first.true_angles()
     renamed, more = second.true_angles()

@@ -349,7 +349,7 @@ class MeasuredGains:
         logs: natural logarithms of the gains in the order of the angles, with mean 0.
         errors: standard errors of ``logs``, by a jackknife over tiles of the pictures.
         pairing: index of the pictures that are perpendicular: 0 for 0 and 90, 1 for 0 and 45, 2 for 0 and 135, as in
-            ``Measures.residuals``. It is None if the samples contradict all three.
+            ``Measures.residuals``. It is ``None`` if the samples contradict all three.
     """
 
     logs: tuple[float, ...]

@@ -165,7 +165,7 @@ class MosaicFiles:
     def depth(self, path: Path, values: NDArray[Any]) -> tuple[int, int | None]:
         """Return the number of bits per pixel in a file, and the full scale that the file states.
 
-        The full scale is None if the file does not state it, or if the user specifies ``bits``.
+        The full scale is ``None`` if the file does not state it, or if the user specifies ``bits``.
         """
         stated = self._raw.full_scale(path, values) if self._options.bits is None else None
         return self._raw.container(path, values.dtype), stated
@@ -575,7 +575,7 @@ def levels_of_pictures(
         options: options ``bits`` and ``saturation`` of the user.
 
     Returns:
-        The levels, and notes for the user. The levels are None if the full scale of each file is known.
+        The levels, and notes for the user. The levels are ``None`` if the full scale of each file is known.
 
     Raises:
         PolarguideError: a value exceeds ``--bits``, or ``--saturation`` is out of range.

@@ -89,7 +89,7 @@ class Exposure:
     """Polarizer angle and gain of one picture of a view.
 
     Attributes:
-        angle: angle of the polarizer in degrees, in [0, 180). It is None if the angle is unknown, or if there is no
+        angle: angle of the polarizer in degrees, in [0, 180). It is ``None`` if the angle is unknown, or if there is no
             polarizer.
         filtered: True if a polarizer was in front of the lens or the sensor.
         gain: brightness of the exposure relative to the other pictures of the scene. Pixel values are divided by it.
@@ -220,7 +220,7 @@ class Line:
     Attributes:
         number: number of the line; the first line of the file is 1.
         file: normalized name of the picture, relative to ``polar/`` of a scene or to the folder of the photographs.
-        view: name of the picture's view. All pictures of a view share a pose. If it is None, the view has only this
+        view: name of the picture's view. All pictures of a view share a pose. If it is ``None``, the view has only this
             picture and the name of the file without suffix.
         angle: angle of the polarizer.
         gain: exposure relative to the other pictures; None if the cell is empty.
@@ -340,7 +340,7 @@ def table_text(lines: Iterable[tuple[str, str, Exposure, float | None, str]]) ->
 
     Args:
         lines: tuple of file, view, exposure, modulation and note for each picture. The modulation (see
-            ``FittedAngle``) is None if it was not fitted.
+            ``FittedAngle``) is ``None`` if it was not fitted.
     """
     rows: list[list[object]] = [[*_COLUMNS]]
     for file, view, exposure, modulation, note in lines:
@@ -382,7 +382,7 @@ def folders_of_angles(root: Path) -> dict[Path, Angle]:
 
 
 def angles_of_names(names: Sequence[str], *, folders: bool = False) -> list[tuple[str, Angle] | None]:
-    """Split each name into view and angle. The result is None for a name without an angle.
+    """Split each name into view and angle. The result is ``None`` for a name without an angle.
 
     A number is an angle if it has a letter or a unit, or if it is a multiple of 15 that is less than 180. Other numbers
     are angles if all numbers of a view are evenly spaced over a half or a full turn, such as 10, 40, ..., 160. If a

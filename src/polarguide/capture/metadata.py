@@ -263,7 +263,7 @@ class Material(msgspec.Struct, frozen=True):
 
     @property
     def kind(self) -> MaterialClass | None:
-        """Class of the material, by which scores are grouped. It is None if the fields do not determine it.
+        """Class of the material, by which scores are grouped. It is ``None`` if the fields do not determine it.
 
         A material is a metal if it has an extinction coefficient ``k``, or the type of a metal. It is a dielectric if
         it has a refractive index ``ior``, or the type of a dielectric. Both are rough if ``alpha`` exceeds ``ROUGH``. A

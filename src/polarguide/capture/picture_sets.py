@@ -115,8 +115,8 @@ class PictureFit:
         label: name of the file; for a video also the number of the frame.
         angle: stated polarizer angle as displayed, in degrees.
         gain: number by which the values of the picture are divided.
-        looks_like: angle in degrees at which the prediction matches the picture best. It is None if the light does not
-            determine the angle.
+        looks_like: angle in degrees at which the prediction matches the picture best. It is ``None`` if the light does
+            not determine the angle.
         error: standard error of ``looks_like`` in degrees, or None.
         residual: root mean square of the residuals, relative to full scale.
         left_out: True if the picture is excluded from the fit of Stokes vectors.

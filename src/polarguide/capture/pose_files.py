@@ -47,7 +47,7 @@ quarter.
 
 
 def is_centered(size: Size, center: tuple[float | None, float | None]) -> bool:
-    """Return True if a principal point is near the center of the picture. Coordinates that are None are ignored."""
+    """Return True if a principal point is near the center of the picture. Coordinates that are ``None`` are ignored."""
     return all(
         place is None or abs(place - side / 2) <= _OFF_CENTER * side
         for place, side in zip(center, size, strict=True)
@@ -64,7 +64,7 @@ def settled_size(
     Args:
         where: file and camera that an error message names.
         sizes: possible sizes. The most likely size is first.
-        center: principal point. A coordinate is None if it is unknown.
+        center: principal point. A coordinate is ``None`` if it is unknown.
         in_pixels: if True, other numbers of the camera are in pixels, so they depend on the size.
 
     Raises:

@@ -187,8 +187,8 @@ class Scene:
         test_names: names of the held-out views, sorted.
         points: sparse points in the world, [M, 3] float32.
         point_colors: display-encoded colors of the points, [M, 3] uint8.
-        refractive_index: refractive index of all surfaces according to ``scene.json``. It is None if the file states
-            no refractive index or several.
+        refractive_index: refractive index of all surfaces according to ``scene.json``. It is ``None`` if the file
+            states no refractive index or several.
         downscale: side of the pixel boxes that were averaged; 1 for pictures at full size.
         transfer: assumed encoding of the files, "linear" or "srgb". The views are always linear.
         digest: SHA-256 of the names and contents of all files, as hexadecimal digits.

@@ -105,8 +105,8 @@ def camera_for_picture(camera: Any, geometry: Geometry, where: str) -> Any:
     """Convert a COLMAP camera to the pixels of the developed picture.
 
     Raises:
-        PolarguideError: the size of the camera differs from the stored picture, the developed picture, and every
-            resized copy.
+        PolarguideError: the size of the camera matches neither the stored nor the developed picture. It is also not
+            that of a resized copy.
     """
     width, height = geometry.size
     size = (camera.width, camera.height)

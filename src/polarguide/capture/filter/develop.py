@@ -29,8 +29,8 @@ class Shift:
         x: shift to the right in pixels. If there is a ``warp``, it is the shift of the picture's center.
         y: shift down in pixels, as ``x``.
         trusted: True if the estimate is reliable.
-        warp: affine matrix [2, 3] from pixels of the first shot to pixels of this shot, row by row. It is None if the
-            shot is not rotated. The center of the first pixel is at (0, 0).
+        warp: affine matrix [2, 3] from pixels of the first shot to pixels of this shot, row by row. It is ``None`` if
+            the shot is not rotated. The center of the first pixel is at (0, 0).
     """
 
     x: float

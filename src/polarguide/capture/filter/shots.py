@@ -280,15 +280,10 @@ def find_single_shots(
 ) -> tuple[list[SingleShot], list[Path]]:
     """Find the photographs of a folder with their views and angles.
 
-    The angles are taken from the first of these sources that exists:
-
-    - the argument ``angles``
-    - the table ``angles.csv`` in the folder
-    - the names of the subfolders (``0``, ``30``, ``unknown``, ``none``, ...)
-    - the names of the files (``cup_045.jpg``, ``cup_a30.jpg``)
-
-    Files whose names differ only in the angle belong to one view. A table may state
-    the view of each file.
+    The argument ``angles`` specifies the angles. Without it, they are read from the table ``angles.csv`` in the folder.
+    Without this table, the names of the subfolders are angles (``0``, ``30``, ``unknown``, ``none``, ...), or the names
+    of the files contain angles (``cup_045.jpg``, ``cup_a30.jpg``). Files whose names differ only in the angle belong to
+    one view. A table may state the view of each file.
 
     Args:
         root: the folder.
@@ -340,8 +335,8 @@ def find_single_shots(
 def views_of_names(folder: Path, files: Sequence[Path]) -> list[tuple[str, Angle] | None]:
     """Return the view and the angle in the name of each file of a folder.
 
-    The result is None for a name without an angle. If all files are named by an angle only, they are one view with the
-    name of the folder.
+    The result is ``None`` for a name without an angle. If all files are named by an angle only, they are one view with
+    the name of the folder.
     """
     names = angles_of_names([stem_of(path) for path in files])
     alone = all(name is not None and not name[0] for name in names)

@@ -362,7 +362,7 @@ def heif_tags(data: bytes) -> bytes:
 
 
 def heif_colors(data: bytes) -> tuple[int | None, bytes | None]:
-    """Return the transfer characteristics and the ICC profile of a HEIC file. Each is None if the file lacks it.
+    """Return the transfer characteristics and the ICC profile of a HEIC file. Each is ``None`` if the file lacks it.
 
     Raises:
         Exception: the file is damaged, or pillow-heif is not installed. There are several kinds of errors.

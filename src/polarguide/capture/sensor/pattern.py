@@ -438,7 +438,7 @@ def color_filters(blocks: NDArray[Any], saturation: float, floor: float = 0.0) -
         floor: stored value without light.
 
     Returns:
-        The kind of sensor. It is None if there are too few bright samples, or if all colors have equal values.
+        The kind of sensor. It is ``None`` if there are too few bright samples, or if all colors have equal values.
     """
     lit = (blocks < saturation).all(axis=(1, 2))
     cells = blocks[lit].reshape(-1, 4, 2, 4, 2).sum(axis=(2, 4), dtype=np.float64) - 4 * floor

@@ -10,10 +10,10 @@ measures S0 and two components of polarization for each color. P is the polariza
 the rendered normal, and U is the polarization at 45 degrees to this plane. ``rho`` are Fresnel's degrees of
 polarization.
 
-- The diffuse light d of a dielectric is the same in all views, and its specular light s is unknown in each view: ``S0 =
-d + s``, ``P = k rho_s s - rho_d d``. Roughness reduces the specular polarization by a factor k in ``ROUGH``.
+- The diffuse light d of a dielectric is the same in all views, and its specular light s is unknown in each view:
+  ``S0 = d + s``, ``P = k rho_s s - rho_d d``. Roughness reduces the specular polarization by a factor k in ``ROUGH``.
 - A metal mirrors unknown light and polarizes it according to its reflectance r: ``P = rho(r) S0``. Its color is the
-color of the mirrored light times r, so r is derived from the observed color.
+  color of the mirrored light times r, so r is derived from the observed color.
 
 Unpolarized light has no U. Polarized light changes P about as much as U. A metal preserves at most the share
 ``conductor_oblique_share`` of U (aluminum 0.98 at 45 degrees and 0.91 at 60; copper and gold 0.57 at 60 and 0.1 at 70).
