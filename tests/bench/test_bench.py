@@ -198,7 +198,7 @@ def test_a_changed_file_is_refused_before_anything_is_done(
     data = picture.read_bytes()
     picture.write_bytes(data + b"x")
     try:
-        Fault("v001_045.png", "checksums.txt", "another").raised_by(
+        Fault("v001_045.png", "checksums.txt", "other contents").raised_by(
             run_bench, rendered, BenchOptions(jobs=1), bench=bench
         )
     finally:

@@ -102,7 +102,7 @@ def test_broken_captures_are_rows_and_the_others_go_on_also_after_a_stop(
 
 def test_two_in_one_folder_exclude_each_other(collection: list[Capture], tmp_path: Path) -> None:
     with locked(tmp_path, "batch"):
-        Fault("", "nobody", "another batch").raised_by(run_batch, collection, tmp_path, OPTIONS)
+        Fault("", "no other command").raised_by(run_batch, collection, tmp_path, OPTIONS)
     Fault("recipe").raised_by(run_batch, [replace(collection[0], recipe="magic")], tmp_path / "new", OPTIONS)
     assert not (tmp_path / "new").exists()
 

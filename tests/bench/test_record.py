@@ -194,7 +194,7 @@ def test_files_and_that_a_part_is_not_written_over(tmp_path: Path) -> None:
     }
     assert "Pictures are in the reports of the parts." in (tmp_path / "all" / "report.html").read_text()
     before = (y / "results.json").read_bytes()
-    Fault(expected="a folder other than").raised_by(join_tables, [x, y], y)
+    Fault(expected="joined records").raised_by(join_tables, [x, y], y)
     assert (y / "results.json").read_bytes() == before
 
 

@@ -166,7 +166,7 @@ def test_a_finished_scene_is_verified(
         (out / name).unlink()
     else:
         (out / name).write_bytes((out / name).read_bytes() + b"x")
-    found = "file" if lost else "another"
+    found = "file" if lost else "other contents"
     Fault(name, "", found).raised_by(synthesize, spec, out, SETTINGS, Reporter(), threads=1)
 
 

@@ -199,7 +199,7 @@ def test_a_run_of_another_scene_is_not_put_beside() -> None:
         SimpleNamespace(folder=Path(name), configuration=SimpleNamespace(scene=name, scene_digest=name))
         for name in ("cup", "car")
     )
-    Fault("car", "a run of cup", "one of car").raised_by(view_run, one, beside=other)
+    Fault("car", "a run of cup", "a run of car").raised_by(view_run, one, beside=other)
 
 
 def test_colors_of_depths_stay_while_the_camera_moves():
