@@ -116,9 +116,9 @@ def held_out_check(capture: Capture) -> Check:
         (
             True,
             "warning",
-            f"{finding} They do not show much of {listed([f'{name} ({shares[name]:.0%})' for name in named])}.",
-            "Scores of these views measure a guess: compare the scores of seen pixels. Next time, add a low ring of "
-            "views that shows the surroundings.",
+            f"{finding} Shares that no training view shows: {listed([f'{name} {shares[name]:.0%}' for name in named])}.",
+            "Compare the scores of seen pixels, because other pixels can only be guessed. For new captures, add a low "
+            "ring of views that shows the surroundings.",
         ),
     )
     return Check("held_out", *outcome, tuple(named), {"unseen": shares})
