@@ -116,7 +116,7 @@ def held_out_check(capture: Capture) -> Check:
         (
             True,
             "warning",
-            f"{finding} Shares that no training view shows: {listed([f'{name} {shares[name]:.0%}' for name in named])}.",
+            f"{finding} Shares that none of them shows: {listed([f'{name} {shares[name]:.0%}' for name in named])}.",
             "Compare the scores of seen pixels, because other pixels can only be guessed. For new captures, add a low "
             "ring of views that shows the surroundings.",
         ),

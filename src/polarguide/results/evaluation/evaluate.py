@@ -158,7 +158,7 @@ class ErrorSheet:
             for key, end in ends.items()
         }
         bars |= dict.fromkeys(("measured", "predicted"), figures.angle_wheel())
-        bars["photograph"] = figures.color_patch(NOT_COUNTED, "gray: not counted; stripes: not photographed")
+        bars["photograph"] = figures.color_patch(NOT_COUNTED, "gray: no score, stripes: unseen")
         sheet = contact_sheet(
             rows,
             [row.name for row in self._rows],
