@@ -173,7 +173,7 @@ def present_folder(
 
     The settings are in presentation.json in the folder. A scene's settings apply to all its runs; a run's own
     settings take precedence. Omitted options keep their values, "none" removes a value, and without options
-    the settings are printed. `polarguide view RUN` sets the same with the mouse. VIEW,X,Y is a pixel of a
+    the settings are printed. `polarguide view RUN` sets crop box and exposure with the mouse. VIEW,X,Y is a pixel of a
     photograph, from its top left corner.
 
     Args:

@@ -62,7 +62,7 @@ class RunConfiguration:
         device: device of the training.
         test_views: names of the held-out views.
         version: version of polarguide.
-        painted: hash of the painted materials of the training, see ``runs.painted``. None without painted materials.
+        painted: hash of materials that were painted in the viewer of an earlier version. None without them.
     """
 
     scene: Annotated[str, msgspec.Meta(min_length=1)]
@@ -85,7 +85,6 @@ class RunConfiguration:
         recipe_data: dict[str, Any],
         settings: ResolvedSettings,
         device: torch.device,
-        painted: str | None = None,
     ) -> RunConfiguration:
         """Return the record of a training."""
         return cls(
@@ -98,7 +97,6 @@ class RunConfiguration:
             transfer="srgb" if scene.transfer == "srgb" else "linear",
             device=str(device),
             test_views=scene.test_names,
-            painted=painted,
         )
 
     def save(self, run: Path) -> None:

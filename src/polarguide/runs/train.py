@@ -30,20 +30,18 @@ from polarguide.runs.folder import (
     load_checkpoint,
     most_gaussians,
     resolve,
-    save_checkpoint,
     writing_to,
 )
 from polarguide.runs.health import HealthCheck, MetalReport, PlyFile, PolarizerReport, RecordedWarnings
 from polarguide.runs.memory_plan import MemoryPlan, pixels_of, plan_memory
 from polarguide.runs.model import GaussianModel
 from polarguide.runs.opened import OpenedRun, read_scene, trained_scene
-from polarguide.runs.painted import FOLDER, read_painted
 from polarguide.training.angles.fits import gaussian_training
 from polarguide.training.callback import AnyCallback
 from polarguide.training.context import TrainingContext
 from polarguide.training.distributed import Ranks, backend_of, process_group
 from polarguide.training.loop import TrainingLoop
-from polarguide.training.metals.search import looks, warn_of_unused_materials
+from polarguide.training.metals.search import warn_of_unused_materials
 from polarguide.training.recipe import Recipe
 from polarguide.training.settings import ResolvedSettings, TrainSettings
 from polarguide.training.state import TrainingState
@@ -101,12 +99,7 @@ def train_gaussians(
         check_trainable(loaded)
         resolved = resolve(settings, loaded, method, earlier, processes=ranks.world)
         _report_settings(settings, resolved, loaded, ranks, reporter, resume=resume)
-        painted = read_painted(out, loaded) if resume else None
-        loaded = loaded if painted is None else painted.over(loaded)
-        digest = None if painted is None else painted.digest
-        configuration = RunConfiguration.of(
-            loaded, method.name, method.data(), resolved, backend.device, digest
-        )
+        configuration = RunConfiguration.of(loaded, method.name, method.data(), resolved, backend.device)
         state = None
         if resume:
             if leads:
@@ -164,24 +157,14 @@ def _report_settings(
 def _resumed_state(
     out: Path, recipe: Recipe, configuration: RunConfiguration, reporter: Reporter, *, leads: bool
 ) -> TrainingState | None:
-    """Read the state to resume from. Return None if the run has no checkpoint.
-
-    If the painted materials have changed since the training, the state is set back to the last step that searches for
-    metals.
-    """
-    settings = configuration.settings
-    recorded = RunConfiguration.load(out)
-    check_same_run(recorded, configuration, out)
+    """Read the state to resume from. Return None if the run has no checkpoint."""
+    check_same_run(RunConfiguration.load(out), configuration, out)
     state = None
     if os.path.lexists(out / CHECKPOINT):  # a broken link is an error, not a missing file
         state = load_checkpoint(out, recipe, torch.device(configuration.device))
-        _check_state(state, settings, out)
+        _check_state(state, configuration.settings, out)
     else:
         reporter.say(f"{out} has no checkpoint: the training begins at step 0")
-    if recorded.painted != configuration.painted:
-        _go_back(state, recipe, settings, out, reporter)
-        if state is not None and leads:
-            save_checkpoint(out, state)  # before run.json records the painted materials
     return state
 
 
@@ -271,8 +254,8 @@ def check_same_run(old: RunConfiguration, new: RunConfiguration, out: Path) -> N
             remedy=f"Use --steps {old.settings.steps}, or train with --steps {new.settings.steps} into a new folder: "
             "stages are shares of all steps, so that their number is fixed.",
         )
-    # The place of the scene and the device do not change the result; painted materials may change.
-    for field in sorted(old.__annotations__.keys() - {"scene", "device", "painted"}):
+    # The place of the scene and the device do not change the result.
+    for field in sorted(old.__annotations__.keys() - {"scene", "device"}):
         a = getattr(old, field)
         b = getattr(new, field)
         if a != b and a is not None:
@@ -312,34 +295,6 @@ def check_step(step: int, settings: ResolvedSettings, out: Path) -> None:
             found=f"the state after step {step}",
             remedy="Train again into a new folder.",
         )
-
-
-def _go_back(
-    state: TrainingState | None, recipe: Recipe, settings: ResolvedSettings, out: Path, reporter: Reporter
-) -> None:
-    """Return to the last step that searches for metals, so that painted materials have an effect.
-
-    Args:
-        state: state of the training, which is changed in place. None if the training has not begun.
-
-    Raises:
-        PolarguideError: the recipe does not use materials, or the training is too short.
-    """
-    last = max(looks(recipe, settings), default=None)
-    if last is None:
-        raise PolarguideError(
-            out / FOLDER,
-            expected="a training with a search for metals",
-            found=f"{recipe.name} in {settings.steps} steps, with --materials {settings.materials}",
-            remedy="Remove the folder, or train polarguide-stokes in 1,500 steps or more.",
-        )
-    if state is not None and state.step > last:
-        reporter.say(
-            f"{out / FOLDER} has changed: training continues at step {last}, which decides on metals"
-        )
-        state.step = last
-        state.drop("frozen.")
-        state.footprints = None
 
 
 def ignored_filters(recipe: str) -> str:
