@@ -47,9 +47,7 @@ def train_scene(
 ) -> None:
     """Train a recipe on a scene.
 
-    Ctrl-C stops the training and saves its state; --resume continues to the same result. Several processes share the
-    views
-    of each step: torchrun --nproc-per-node N --no-python polarguide train ...
+    Ctrl-C stops the training and saves its state; --resume continues to the same result.
 
     Args:
         scene: Scene folder: polar/<view>_000|_045|_090|_135.png or four folders I-00 I-45 I-90 I-135, and a COLMAP

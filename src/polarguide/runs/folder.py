@@ -355,8 +355,6 @@ def resolve(
     scene: Scene,
     method: Recipe,
     resumed: ResolvedSettings | None = None,
-    *,
-    processes: int = 1,
 ) -> ResolvedSettings:
     """Return the complete settings of a training.
 
@@ -364,7 +362,6 @@ def resolve(
         settings: settings that the user specified.
         scene, method: scene and recipe of the training.
         resumed: settings of the run to resume. They take precedence over defaults that depend on the scene.
-        processes: number of processes that share the views of a step.
 
     Raises:
         PolarguideError: a setting is out of range.
@@ -375,7 +372,7 @@ def resolve(
         **vars(settings),
         "steps": _steps(sizes),
         "refractive_index": index_of(None, scene.refractive_index),
-        "views_per_step": processes,
+        "views_per_step": 1,
         **recorded,
         "gaussians": most_gaussians(sum(sizes), method, settings, resumed),
         **settings.specified(),

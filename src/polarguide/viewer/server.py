@@ -353,15 +353,8 @@ def watched(
     """Open a viewer for a training. The context yields the function that the training calls between steps.
 
     Raises:
-        PolarguideError: the training has several processes, or the server cannot listen at the address.
+        PolarguideError: the server cannot listen at the address.
     """
-    if loop.ranks.world > 1:
-        raise PolarguideError(
-            "viewer",
-            expected="one process",
-            found=f"{loop.ranks.world}",
-            remedy="Omit this option, and view the checkpoints with polarguide view RUN.",
-        )
     scene = loop.context.scene
 
     def look(ends: Ends) -> None:
