@@ -75,13 +75,6 @@ def inspect_capture(
         fix: New folder for a corrected copy of the scene, written if the order, the direction or the zero is wrong
             and the correction is certain.
     """
-    if fix is not None and settings.calibration is not None:
-        raise PolarguideError(
-            "--fix",
-            expected="no --calibration, which the corrected copy would lack",
-            found="both options",
-            remedy="Prepare the mosaics again with --calibration, and fix that scene.",
-        )
     set_threads(compute.threads)
     reporter = ConsoleReporter()
     inspection = importlib.import_module("polarguide.inspection.inspect")
