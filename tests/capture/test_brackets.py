@@ -28,7 +28,6 @@ from polarguide.capture.brackets import merge as merge_measured
 from polarguide.capture.exposure_files import exposure_name, list_shot_files
 from polarguide.capture.layout import find_layout
 from polarguide.capture.view_reader import ViewData, read_view
-from polarguide.cli.app import run
 from polarguide.core.progress import Reporter
 from polarguide.geometry.polarizer import ANGLES, malus
 from polarguide.inspection.capture import read_capture
@@ -409,19 +408,6 @@ def test_sets_at_other_angles_refuse_brackets(tmp_path: Path) -> None:
     write_bracketed_shots(tmp_path / "shots", "cup", angles=(0, 60, 120))
     (shot,) = find_shots([tmp_path / "shots"])
     Fault("cup_0_ev0.png", "one exposure", "3 exposures").raised_by(read_shot, shot)
-
-
-def test_measure_reads_brackets(tmp_path: Path) -> None:
-    write_bracket(tmp_path / "line", "part")
-    sensor = ("--sensor", "IMX250MZR", "--bits", "12", "--black-level", "64", "--threads", "1")
-    out = tmp_path / "out"
-    command = ["measure", str(tmp_path / "line"), "--out", str(out), *sensor, "--roi", "lamp=85,46,10,10"]
-    assert run(command) == 0
-    header, row = (line.split(",") for line in (out / "table.csv").read_text().splitlines())
-    values = dict(zip(header, row, strict=True))
-    assert values["shot"] == "part"
-    assert float(values["dolp_mean"]) == pytest.approx(0.4, abs=0.02)
-    assert float(values["s0_mean"]) > 10
 
 
 def test_inspect_shows_the_range(tmp_path: Path) -> None:

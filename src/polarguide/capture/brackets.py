@@ -99,7 +99,8 @@ class Bracket:
     @property
     def normal(self) -> int:
         """Index of the exposure that is nearest to the normal one."""
-        return 0 if self.stops is None else min(range(len(self.stops)), key=lambda k: abs(self.stops[k]))
+        stops = self.stops or (0.0,)
+        return min(range(len(stops)), key=lambda k: abs(stops[k]))
 
 
 SINGLE = Bracket(((),), (0.0,))

@@ -108,13 +108,14 @@ def list_shot_files(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
 def one_of_each_shot(files: Sequence[Path]) -> list[Path]:
     """Return one of the files of each shot: the file nearest to the normal exposure, or the first one.
 
-    Files of one shot have the same folder and suffix.
+    Files of one shot have the same folder and suffix. A file without a label is a shot of its own.
     """
-    nearest: dict[tuple[Path, str, str], tuple[float, Path]] = {}
+    nearest: dict[object, tuple[float, Path]] = {}
     for path in files:
         name = exposure_name(path)
         stops = 0.0 if name.stops is None else abs(name.stops)
-        key = path.parent, name.shot, path.suffix.lower()
+        labeled = name != ExposureName(stem_of(path))
+        key = (path.parent, name.shot, path.suffix.lower()) if labeled else path
         if key not in nearest or stops < nearest[key][0]:
             nearest[key] = stops, path
     return [path for _, path in nearest.values()]
