@@ -18,7 +18,7 @@ from polarguide.capture.layout import describe_contents, index_files
 from polarguide.capture.presentation import PRESENTATION_FILE
 from polarguide.capture.view import ANGLES, FULL_CODE
 from polarguide.capture.view_reader import read_view
-from polarguide.capture.write import intensity_codes, write_view
+from polarguide.capture.write import intensity_codes, rounded_radiance, write_view
 from polarguide.core.errors import PolarguideError
 from polarguide.core.files import read_file, temporary_folder, write_whole
 from polarguide.core.progress import SILENT, Reporter
@@ -132,13 +132,16 @@ def _require_inside(root: Path, source: Path) -> None:
 
 def _rotate_view(capture: Capture, change: Calibration, folder: Path, view: str) -> None:
     data = read_view(capture.layout, view, factor=1, transfer=capture.transfer)
-    full = int(np.iinfo(data.peak.dtype).max)
-    lost = np.asarray(data.invalid | data.black | (data.peak >= full - full // 500))
-    rotated = oriented((data.codes / np.float32(FULL_CODE)).astype(np.float32), change) / change.peak
+    full = data.largest_value
+    lost = np.asarray(data.invalid | data.saturated(full - full // 500))
+    rotated = oriented((data.codes / np.float32(FULL_CODE)).astype(np.float32), change)
     old = index_files(folder / "invalid", SUFFIXES).get(view)
     if old is not None:
         old.unlink()
-    write_view(folder, view, intensity_codes(rotated, lost), lost)
+    if data.is_radiance:
+        write_view(folder, view, rounded_radiance(np.maximum(rotated, 0)), lost)
+    else:
+        write_view(folder, view, intensity_codes(rotated / change.peak, lost), lost)
 
 
 def _corrected_metadata(capture: Capture, change: Calibration) -> bytes:
