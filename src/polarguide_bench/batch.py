@@ -11,7 +11,7 @@ from typing import Any
 
 import pandas as pd
 
-from polarguide.capture.layout import find_layout, refuse_scene
+from polarguide.capture.layout import is_posed_scene, refuse_scene
 from polarguide.core.errors import PolarguideError, require
 from polarguide.core.files import check_out, make_folder, require_inside, write_text
 from polarguide.core.options import ComputeOptions, PathLike
@@ -195,13 +195,6 @@ def run_batch(
         return [_row(task, failures) for task in tasks]
 
 
-def is_scene(folder: Path) -> bool:
-    """Return True if a folder is a scene with poses, which needs no preparation."""
-    with contextlib.suppress(PolarguideError, OSError):
-        return (folder / "sparse").is_dir() and bool(find_layout(folder))
-    return False
-
-
 def _task(capture: Capture, root: Path, options: BatchOptions) -> Processing:
     path = capture.path.absolute()
     folder = (root / CAPTURES / capture.name).absolute()
@@ -212,7 +205,7 @@ def _task(capture: Capture, root: Path, options: BatchOptions) -> Processing:
     request = Request(
         source=str(path),
         stamp=stamp,
-        prepare=None if is_scene(path) else capture.prepare.record(),
+        prepare=None if is_posed_scene(path) else capture.prepare.record(),
         recipe=capture.recipe,
         settings=capture.settings,
         reading=capture.reading,
