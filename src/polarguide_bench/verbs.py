@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import tyro
 
 import polarguide
-from polarguide.capture.layout import is_posed_scene
 from polarguide.cli.console import ConsoleReporter, say, set_threads
 from polarguide.core.errors import PolarguideError, require, require_package
 from polarguide.core.files import read_rows, stored
@@ -249,7 +248,7 @@ def batch(
 
     def process(lines: Sequence[_Line]) -> None:
         module = importlib.import_module("polarguide_bench.batch")
-        captures = [_capture(line, is_posed_scene(line.path), options) for line in lines]
+        captures = [_capture(line, module.is_posed_scene(line.path), options) for line in lines]
         rows = module.run_batch(captures, out, settings, reporter=ConsoleReporter())
         say(f"page: {out / 'index.html'}   table: {out / 'results.csv'}")
         failed = [f"{row.name}: {row.error}" for row in rows if row.state == "failed"]
