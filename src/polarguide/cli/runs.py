@@ -74,7 +74,7 @@ def train_scene(
             )
         except KeyboardInterrupt as stopped:
             if str(stopped):  # a requested stop; the text names the last step
-                say(f"{stopped}; go on with the same command and --resume")
+                say(f"{stopped}; the same train command and --resume continue")
             raise
     say(f"trained: {out}   next: {command('eval', out)}   {command('view', out)}")
 

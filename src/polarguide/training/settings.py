@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
+import tyro
+
 from polarguide.core.errors import PolarguideError
 from polarguide.core.options import EXPOSURES, MOST, Exposures, check_choice, check_count
 
@@ -66,7 +68,7 @@ class TrainSettings:
     background: Background = "auto"
     gaussians: int | None = None
     exposures: Exposures = "captured"
-    begin_again: bool = True
+    begin_again: tyro.conf.Fixed[bool] = True
     materials: Materials = "auto"
 
     def __post_init__(self) -> None:
