@@ -6,6 +6,9 @@ its guide uses the weight 0.05.
 
     polarguide export RUN --format normals --layout brush --out FOLDER
     python benchmarks/accuracy/normal_maps.py SCENE FOLDER/brush OUT [--weight 0.05] [--downscale 2] [--steps 1500]
+
+Compare the run with one without the loss:
+
     polarguide train SCENE --recipe 3dgs --downscale 2 --steps 1500 --out PLAIN
     polarguide eval OUT
     polarguide eval PLAIN

@@ -203,8 +203,8 @@ def export_normals(
             normal = torch.where(decided[..., None], result.normal, 0.0)
             alpha = 255 * decided.numpy().astype(np.uint8)
             file = f"{name}{SUFFIX}"
-            colors = reader.encode(figures.normal_to_rgb(normal, view.camera))
-            figures.write_png(folder / reader.folder / file, colors, alpha)
+            codes = reader.encode(figures.normal_to_rgb(normal, view.camera))
+            figures.write_png(folder / reader.folder / file, codes, alpha)
             if reader.masks:
                 write_png_file(folder / reader.masks / file, alpha)  # nerfstudio accepts one channel only
             _write_picture(folder / IMAGES / file, training_picture(run, view, result, options), presented)
