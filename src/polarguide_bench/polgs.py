@@ -243,11 +243,11 @@ def _stages(count: int, densified: int) -> tuple[Stage, ...]:
     stages = [Stage("plain", 1 / count, reflection=False, densify=True)]
     for number in range(1, count):
         weights = SurfelWeights(
-            polarization=0.1,
+            polarization=1.0,
             opacity=0.01,
             curvature=0.005,
             flatness=0.1,
-            consistency=5 * (0.01 + 0.1 * (number + 0.5) / count),
+            consistency=0.01 + 0.1 * (number + 0.5) / count,
         )
         densify = number < densified
         name = f"{'densify' if densify else 'refine'} {number}"
