@@ -17,7 +17,7 @@ from polarguide.gaussians.ply import read_ply
 from polarguide.geometry.camera import Camera
 from polarguide.raster import choose_backend
 from polarguide.recipes import recipe_named
-from polarguide.recipes.registry import recipe_names
+from polarguide.recipes.registry import recipes
 from polarguide.results.evaluation.scores import score_view
 from polarguide.results.evaluation.target import ViewTarget
 from polarguide.results.export.adapters import ply_fields
@@ -196,7 +196,7 @@ def test_curvature_is_the_laplacian_of_the_covered_normals() -> None:
 
 def test_the_recipe_is_found_by_its_name() -> None:
     recipe = recipe_named("polgs")
-    assert {"polgs", "polgs:strength", "polgs:unpolarized"} <= set(recipe_names())
+    assert {"polgs", "polgs:strength", "polgs:unpolarized"} <= recipes().keys()
     assert [each.name for each in ablations_of("polgs")] == ["polgs:strength", "polgs:unpolarized"]
     weights = [stage.weights for stage in recipe.stages if stage.reflection]
     assert {each.polarization for each in weights} != {0}
