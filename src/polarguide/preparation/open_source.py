@@ -15,6 +15,7 @@ from pathlib import Path
 from polarguide.capture.colmap.model import holds_model, view_of_name
 from polarguide.capture.colmap.poses import Poses
 from polarguide.capture.datasets.readers import PISR_SENSOR, detect_dataset, open_dataset
+from polarguide.capture.exposure_files import index_shot_files, list_shot_files, shot_stem
 from polarguide.capture.exposures import TABLE, angles_of_names, folders_of_angles, parse_angle
 from polarguide.capture.filter.camera_files import QUARTER_TURNS, TURNS
 from polarguide.capture.filter.consecutive import (
@@ -25,7 +26,7 @@ from polarguide.capture.filter.consecutive import (
 )
 from polarguide.capture.filter.shots import SHOT_SUFFIXES, find_shots
 from polarguide.capture.formats.pictures import SUFFIXES, decode_picture, read_picture
-from polarguide.capture.layout import angle_folders, describe_contents, index_files, list_files
+from polarguide.capture.layout import angle_folders, describe_contents
 from polarguide.capture.pose_files import SUFFIXES as POSE_FILES
 from polarguide.capture.pose_files import TEST, parts_of_poses, read_parts
 from polarguide.capture.sensor.pattern import SENSOR_NAMES
@@ -144,7 +145,7 @@ def _consecutive(
     if angles is None or angles == "none" or angles.lower().endswith(".csv"):
         return settings, None, ()
     stated = [parse_angle(part) for part in angles.split(",")]
-    files = list(index_files(root, SHOT_SUFFIXES).values())
+    files = list(index_shot_files(root, SHOT_SUFFIXES).values())
     notes: tuple[str, ...] = ()
     each = settings.shots_per_view
     if each is None and (each := shots_of_one_place(files)) is not None:
@@ -173,7 +174,7 @@ def _consecutive(
     shots: Shots = {}
     for number, path in enumerate(files):
         place = number % len(ANGLES)
-        shots.setdefault(files[number - place].stem, {})[round(four[place])] = path
+        shots.setdefault(shot_stem(files[number - place]), {})[round(four[place])] = path
     return settings, shots, notes
 
 
@@ -184,8 +185,8 @@ def _require_photographs(root: Path) -> None:
         PolarguideError: the folder contains raw mosaics, gray pictures or no picture; names of pictures contain numbers
             that may be angles; or consecutive pictures show one place, as shots through a filter do.
     """
-    files = list(index_files(root, SHOT_SUFFIXES).values())
-    if not files or index_files(root, tuple(set(RAW_SUFFIXES) - set(SHOT_SUFFIXES))):
+    files = list(index_shot_files(root, SHOT_SUFFIXES).values())
+    if not files or index_shot_files(root, tuple(set(RAW_SUFFIXES) - set(SHOT_SUFFIXES))):
         raise _unknown_layout(root)
     for path in (files[0], files[-1]):
         if path.suffix.lower() in RAW_SUFFIXES and _is_gray(path):  # like raw mosaics
@@ -287,10 +288,10 @@ def are_single_shots(root: Path, settings: PrepareSettings) -> bool:
         return False
     if settings.angles is not None or (root / TABLE).exists():
         return True
-    files = list_files(root, SHOT_SUFFIXES)
+    files = list_shot_files(root, SHOT_SUFFIXES)
     if not files:
         return any(angle not in ANGLES for angle in folders_of_angles(root).values())
-    shots = [name for name in angles_of_names([stem_of(path) for path in files]) if name is not None]
+    shots = [name for name in angles_of_names([shot_stem(path) for path in files]) if name is not None]
     if any(angle not in ANGLES for _, angle in shots):
         return True
     return len({view for view, _ in shots}) == len(files)
@@ -298,7 +299,7 @@ def are_single_shots(root: Path, settings: PrepareSettings) -> bool:
 
 def _unknown_layout(root: Path) -> PolarguideError:
     """Return the error for a folder whose format is not recognized. It lists the files and possible commands."""
-    mosaics = index_files(root, RAW_SUFFIXES)
+    mosaics = index_shot_files(root, RAW_SUFFIXES)
     folders = sorted(path.name for path in root.iterdir() if path.is_dir() and not path.name.startswith("."))
     names = listed(sorted(path.name for path in mosaics.values()))
     contents = [f"{len(mosaics)} pictures without angles in their names ({names})"] if mosaics else []
