@@ -42,6 +42,7 @@ from polarguide_bench.results import (
 )
 
 BY_KEY = {metric.key: metric for metric in COLUMNS}
+"""Built-in metrics and those of plug-ins, by key."""
 NOT_APPLICABLE = "n/a"
 OVER_SCENES = "over scenes"
 MINUS = "\N{MINUS SIGN}"

@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from polarguide.capture.exposure_files import list_shot_files, one_of_each_shot, shot_stem
 from polarguide.capture.exposures import TABLE
 from polarguide.capture.filter import shots as filter_shots
 from polarguide.capture.filter.consecutive import VIDEO_SUFFIXES
@@ -23,7 +24,7 @@ from polarguide.capture.sensor.pattern import SENSOR_NAMES
 from polarguide.capture.sensor.raw_file import RAW_SUFFIXES
 from polarguide.capture.view import ANGLES
 from polarguide.core.errors import PolarguideError, require
-from polarguide.core.text import canonical, stem_of
+from polarguide.core.text import canonical
 from polarguide_shots import sets
 from polarguide_shots.options import ShotOptions
 from polarguide_shots.sets import ExposureSet, known_indices
@@ -115,10 +116,13 @@ def mosaics(files: Sequence[Path]) -> list[ExposureSet]:
     A set is named like its file without the suffix. If two files in a folder differ only in their suffixes, the names
     contain the suffixes.
     """
-    stems = Counter(path.with_suffix("") for path in files)
+    files = one_of_each_shot(files)
+    stems = Counter((path.parent, shot_stem(path)) for path in files)
     return [
         ExposureSet(
-            stem_of(path) if stems[path.with_suffix("")] == 1 else canonical(path.name), "mosaic", {0: path}
+            shot_stem(path) if stems[path.parent, shot_stem(path)] == 1 else canonical(path.name),
+            "mosaic",
+            {0: path},
         )
         for path in files
     ]
@@ -142,12 +146,13 @@ def _of_files(files: list[Path], options: ShotOptions) -> list[ExposureSet]:
             inside -= listed
         files = [path for path in files if path.parent != folder or path.resolve() in inside]
     by_root: dict[Path, filter_shots.Candidates] = {}
+    files = one_of_each_shot(files)
     for path in files:
         folder = path.resolve().parent
         angle = angle_of_folder(folder)
         if angle is not None:
             views = by_root.setdefault(folder.parent, {})
-            views.setdefault(stem_of(path), {}).setdefault(angle, []).append(path)
+            views.setdefault(shot_stem(path), {}).setdefault(angle, []).append(path)
     for views in by_root.values():
         # A view with one angle means that the folder has the name of an angle by chance.
         if all(len(angles) > 1 for angles in views.values()):
@@ -237,14 +242,14 @@ def _directly_in(root: Path, options: ShotOptions) -> list[ExposureSet]:
     if (root / "polar").is_dir() or ((root / "sparse").is_dir() and len(angle_folders(root)) == len(ANGLES)):
         return _views(find_layout(root))
     if options.sensor is not None and not angle_folders(root):
-        files = list_files(root, RAW_SUFFIXES)
+        files = list_shot_files(root, RAW_SUFFIXES)
         dark = None if options.dark_frame is None else os.path.realpath(options.dark_frame)
         return mosaics([path for path in files if os.path.realpath(path) != dark])
     videos = sets.videos(list_files(root, VIDEO_SUFFIXES))
     if (root / TABLE).is_file():
         listed, others = sets.by_table(root)
         return [*videos, *listed, *_without_angle(others)]
-    files = list_files(root, filter_shots.SHOT_SUFFIXES)
+    files = list_shot_files(root, filter_shots.SHOT_SUFFIXES)
     in_folders = [] if files else sets.by_folder(root)
     if in_folders:
         return [*videos, *in_folders]

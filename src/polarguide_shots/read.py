@@ -15,9 +15,11 @@ from torch import Tensor
 
 from polarguide import optics
 from polarguide.capture import checks
+from polarguide.capture.brackets import SINGLE, Bracket, bracket_notes
 from polarguide.capture.calibration import UNIT_GAINS, oriented, pair_ratio
 from polarguide.capture.colmap.model import fit_camera, read_model
 from polarguide.capture.develop import (
+    BracketedShots,
     LinearShots,
     MosaicFiles,
     as_displayed,
@@ -30,7 +32,7 @@ from polarguide.capture.exposures import FOUR, Angle, normalized
 from polarguide.capture.filter.camera_files import apply_orientation
 from polarguide.capture.filter.develop import moved_shots
 from polarguide.capture.filter.encoding import transfer_of_pictures
-from polarguide.capture.filter.shots import _READ, Shots, read_stack, require_four_shots, stacked
+from polarguide.capture.filter.shots import _READ, require_four_shots, stacked
 from polarguide.capture.layout import (
     KEPT,
     READ,
@@ -43,7 +45,6 @@ from polarguide.capture.sensor.pattern import (
     SIDE,
     Levels,
     require_kind,
-    unusable_samples,
 )
 from polarguide.capture.view import ANGLES, FULL_CODE, View
 from polarguide.capture.view_reader import (
@@ -533,17 +534,19 @@ def develop_mosaic(shot: ExposureSet, options: ShotOptions, part: Part | None) -
         PolarguideError: the file or an option is invalid.
     """
     files = MosaicFiles(options)
-    stored = files.read(shot.where, shot.stored)
+    bracket, exposures = _mosaic_exposures(files, shot)
+    stored = exposures[0]
     pattern = files.pattern
     dark = files.dark(stored.shape)
-    values = files.cut(stored)
     container = 8 * stored.dtype.itemsize
     full = None
     if shot.stored is None:
         container, full = files.depth(shot.files[0], stored)
     levels, notes = levels_of_shot(
-        stored, container, options, bits=options.bits, black=options.black_level, stated=full
+        np.stack(exposures), container, options, bits=options.bits, black=options.black_level, stated=full
     )
+    exposures = [files.cut(each) for each in exposures]
+    values = exposures[bracket.normal]
     levels = replace(levels, gamma=options.gamma)
     assert options.sensor is not None
     require_kind(options.sensor, sample_blocks(values, SIDE), levels)
@@ -558,13 +561,13 @@ def develop_mosaic(shot: ExposureSet, options: ShotOptions, part: Part | None) -
     if cut is not None:
         whole = (values.shape[1] // step, values.shape[0] // step)
         values = np.ascontiguousarray(values[cut])
-        dark = None if dark is None else dark[cut]
         x += cut[1].start
         y += cut[0].start
-    saturated, black = unusable_samples(values, levels, dark)
+    radiance, black = files.merged(bracket, exposures, levels, dark, cut)
+    notes += [] if bracket.single else bracket_notes([radiance.exposures])
     defective = defects([np.minimum(values, levels.white)], pattern.period)
     notes += [defects_note(int(defective.sum()), values.size)] if defective.any() else []
-    linear, masks = files.linear(values, levels, dark, saturated, black, defective, corner=(x, y))
+    linear, masks = files.calibrated(radiance.values, radiance.clipped, black, defective, corner=(x, y))
     saturated, black, defective = masks
     if gains != UNIT_GAINS:
         linear *= files.sample_factors(linear.shape, gains)
@@ -592,6 +595,28 @@ def develop_mosaic(shot: ExposureSet, options: ShotOptions, part: Part | None) -
         origin=(0, 0) if cut is None else (cut[1].start // step, cut[0].start // step),
         whole=whole,
     )
+
+
+def _mosaic_exposures(files: MosaicFiles, shot: ExposureSet) -> tuple[Bracket, list[NDArray[Any]]]:
+    """Read the stored values [H, W] of all exposures of a mosaic.
+
+    Raises:
+        PolarguideError: a file is invalid, or its size or type differs from the first one.
+    """
+    if shot.stored is not None:
+        return SINGLE, [files.read(shot.where, shot.stored)]
+    bracket = Bracket.of([shot.files[0]])
+    exposures: list[NDArray[Any]] = []
+    for (path,) in bracket.files:
+        exposures.append(files.read(path))
+        require(
+            (exposures[-1].shape, exposures[-1].dtype) == (exposures[0].shape, exposures[0].dtype),
+            path,
+            expected=f"{kind_of(exposures[0])} like {bracket.files[0][0].name}",
+            found=kind_of(exposures[-1]),
+            remedy="Save all exposures with the same settings.",
+        )
+    return bracket, exposures
 
 
 def _cut(part: Part | None, shape: tuple[int, ...], step: int) -> tuple[slice, slice] | None:
@@ -653,10 +678,10 @@ def develop(shot: ExposureSet, options: ShotOptions, part: Part | None = None) -
     return _undistorted(
         oriented(data.codes.astype(np.float32) / np.float32(FULL_CODE), options.calibration),
         data.black,
-        np.zeros(data.black.shape, bool) if scale is None else np.asarray(data.peak >= scale),
+        data.saturated(scale) & ~data.black,
         data.invalid,
         data.mask,
-        1 / int(np.iinfo(data.peak.dtype).max),
+        1 / data.largest_value,
         options,
     )
 
@@ -690,21 +715,21 @@ def check_files(options: ShotOptions) -> None:
     calibration_of(options)
 
 
-def _four(shot: ExposureSet, levels: Levels | None = None) -> Shots:
-    """Return the four pictures of a shot, from its files or from memory.
+def _four(shot: ExposureSet, levels: Levels | None = None) -> BracketedShots:
+    """Return the four pictures of a shot at all exposures, from its files or from memory.
 
     Raises:
         PolarguideError: a file cannot be read, or the pictures differ in size, depth or orientation.
     """
     if shot.stored is not None:
-        return stacked(shot.stored, levels=levels)
+        return BracketedShots.single(stacked(shot.stored, levels=levels))
     require_memory_of_each(
         list(shot.files.values()),
         _READ,
         "four shots",
         remedy="Make the pictures smaller, all by the same factor.",
     )
-    return read_stack([shot.files[angle] for angle in ANGLES], levels=levels)
+    return BracketedShots.read([shot.files[angle] for angle in ANGLES], levels=levels)
 
 
 def _filter(shot: ExposureSet, options: ShotOptions) -> Developed:
@@ -716,14 +741,17 @@ def _filter(shot: ExposureSet, options: ShotOptions) -> Developed:
     if shot.stored is None:
         require_four_shots(shot.paths[0].parent, {shot.name: shot.files})
     paths = [shot.files[angle] for angle in ANGLES] if shot.stored is None else []
-    shots = _four(shot)
-    container = 8 * shots.pictures.dtype.itemsize
-    levels, notes = levels_of_shot(shots.pictures, container, options, bits=options.bits or container)
+    read = _four(shot)
+    stored = [picture for shots in read.shots for picture in shots.pictures]
+    container = 8 * stored[0].dtype.itemsize
+    levels, notes = levels_of_shot(np.stack(stored), container, options, bits=options.bits or container)
     if not levels.is_full(container):
-        shots = _four(shot, levels)
+        read = _four(shot, levels)
+    shots = read.shots[read.bracket.normal]
     decision = transfer_of_pictures(paths, options.transfer, lambda: [(shots, ANGLES)])
     notes += [decision.note, *filter(None, [decision.doubt])]
-    linear = LinearShots.of(shots, decision.transfer, align=options.align)
+    linear = LinearShots.of(read, decision.transfer, align=options.align)
+    notes += [] if read.bracket.single else bracket_notes([linear.exposures])
     moved = moved_shots(linear.shifts)
     notes += [f"Shots moved, in pixels: {', '.join(moved)}."] if moved else []
     stated: Sequence[float] = UNIT_GAINS
@@ -776,7 +804,7 @@ def _read_view(shot: ExposureSet, options: ShotOptions) -> tuple[ViewData, int |
         remedy="Free memory, or prepare the scene in a smaller size.",
     )
     data = read_view(layout, shot.view, factor=1, transfer="srgb" if options.transfer == "srgb" else "linear")
-    return data, checks.full_scale(data.histogram, int(np.iinfo(data.peak.dtype).max))
+    return data, checks.full_scale(data.histogram, data.largest_value)
 
 
 def _undistorted(

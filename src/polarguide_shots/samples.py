@@ -16,6 +16,7 @@ from torch import Tensor
 from polarguide.capture import checks
 from polarguide.capture.calibration import ANGLES, Calibration
 from polarguide.capture.develop import COMPARABLE, levels_of_shot, require_one, stated_exposures
+from polarguide.capture.exposure_files import exposure_files
 from polarguide.capture.exposures import Angle, Exposure, analyzers, turned
 from polarguide.capture.filter.camera_files import apply_orientation, orientation_calibration
 from polarguide.capture.filter.encoding import VIDEO, kind_of_file, transfer_of_pictures
@@ -56,6 +57,14 @@ def read_set(name: str, pictures: Sequence[SetPicture], options: ShotOptions) ->
         "a set of one kind of file",
         COMPARABLE,
     )
+    for picture in known:
+        require(
+            len(exposure_files(picture.path)) == 1,
+            picture.path,
+            expected="one exposure of each picture of a set at any angles",
+            found=f"{len(exposure_files(picture.path))} exposures",
+            remedy="Use pictures at 0, 45, 90 and 135 degrees, or polarguide prepare, which merges exposures.",
+        )
     stack = _stack(name, known[0].path, len(known), _read_each(known))
     gains, notes = _gains(known)
     return _samples(
@@ -267,10 +276,10 @@ def samples_of_view(data: ViewData, full: int | None, options: ShotOptions) -> S
     """
     require_no_order(options.calibration, data.name)
     places = known_indices(data.name, data.exposures)
-    saturated = np.zeros(data.black.shape, bool) if full is None else np.asarray(data.peak >= full)
+    saturated = data.saturated(full) & ~data.black
     return SetSamples(
         labels=tuple(f"picture {k + 1}" for k in places),
-        values=data.codes[places],
+        values=data.codes[places] / np.float32(FULL_CODE) if data.is_radiance else data.codes[places],
         exposures=tuple(
             replace(e, angle=float(turned(e.angle or 0.0, options.calibration)))
             for e in (data.exposures[k] for k in places)
@@ -278,7 +287,7 @@ def samples_of_view(data: ViewData, full: int | None, options: ShotOptions) -> S
         lost=np.broadcast_to(saturated, (len(places), *saturated.shape)),
         dark=data.black,
         masked=data.invalid if data.mask is None else data.invalid | ~data.mask,
-        step=1 / float(np.iinfo(data.peak.dtype).max),
+        step=1 / data.largest_value,
         notes=_unused(len(data.exposures) - len(places)),
     )
 
@@ -303,7 +312,7 @@ def state_of(view: View) -> tuple[Mask, Mask, float]:
     # Pixels without polarization information are dark below half of the view's maximum, else saturated.
     dark = (lost & (peak < peak.max() / 2)) | (peak == 0)
     # Codes are multiples of one stored value unless they were decoded or averaged.
-    step = int(np.gcd.reduce(np.flatnonzero(np.bincount(codes.ravel()))))
+    step = 1 if codes.dtype == np.float32 else int(np.gcd.reduce(np.flatnonzero(np.bincount(codes.ravel()))))
     return dark, lost & ~dark, max(step, 1) / FULL_CODE
 
 

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from polarguide.capture.exposure_files import all_exposures, list_shot_files, shot_stem
 from polarguide.capture.exposures import (
     FEWEST,
     LARGEST,
@@ -35,7 +36,7 @@ from polarguide.capture.filter.shots import (
     listed_pictures,
     views_of_names,
 )
-from polarguide.capture.layout import ambiguous, list_files
+from polarguide.capture.layout import ambiguous
 from polarguide.capture.view import ANGLES, listed
 from polarguide.core.errors import PolarguideError, require
 from polarguide.core.files import read_rows, require_file
@@ -102,10 +103,15 @@ class ExposureSet:
 
     @property
     def paths(self) -> tuple[Path, ...]:
-        """All files of the shot: pictures by angle, then the table of a set. Empty for a shot in memory."""
-        pictures = dict.fromkeys(picture.path for picture in self.pictures)
+        """All files of the shot: pictures by angle, then the table of a set. Empty for a shot in memory.
+
+        Further exposures of the pictures are at the end.
+        """
+        pictures = [path for _, path in sorted(self.files.items())]
+        pictures += dict.fromkeys(picture.path for picture in self.pictures)
         table = [] if self.table is None else [self.table]
-        return (*(path for _, path in sorted(self.files.items())), *pictures, *table, *self.others)
+        bracketed = all_exposures(pictures) if self.root is None else []
+        return tuple(dict.fromkeys((*pictures, *table, *self.others, *bracketed)))
 
     @property
     def where(self) -> Path | str:
@@ -222,8 +228,8 @@ def by_folder(root: Path) -> list[ExposureSet]:
     """
     views: dict[str, list[SetPicture]] = {}
     for folder, angle in folders_of_angles(root).items():
-        for path in list_files(folder, SHOT_SUFFIXES):
-            views.setdefault(stem_of(path), []).append(SetPicture(path, angle))
+        for path in list_shot_files(folder, SHOT_SUFFIXES):
+            views.setdefault(shot_stem(path), []).append(SetPicture(path, angle))
     if all(picture.angle in ANGLES for pictures in views.values() for picture in pictures):
         return []
     return [_named_set(root, view, pictures) for view, pictures in sorted(views.items())]

@@ -94,20 +94,19 @@ def sensor_codes(stokes: Array, change: Callable[[Array], Array]) -> NDArray[np.
 
 def clipped_share(out: Path, names: Sequence[str]) -> float:
     """Return the share of samples that are at full scale in the pictures of all views."""
-    files = [file for name in names for file in view_files(out, name, ground_truth=False, raw=False)]
+    files = [file for name in names for file in view_files(out, name, ground_truth=False)]
     return float(np.mean([(_picture(file) == TOP * STEP).mean() for file in files]))
 
 
-def view_files(out: Path, name: str, *, ground_truth: bool, raw: bool) -> list[Path]:
-    """Return the paths of all files of a view. The view is finished when all files exist."""
+def view_files(out: Path, name: str, *, ground_truth: bool) -> list[Path]:
+    """Return the paths of a view's files without those of a simulated sensor."""
     files = [out / picture_name(name, angle) for angle in ANGLES]
-    files += [out / "gt" / f"{name}.npz"] if ground_truth else []
-    return files + ([out / "raw" / f"{name}.png"] if raw else [])
+    return files + ([out / "gt" / f"{name}.npz"] if ground_truth else [])
 
 
 def photograph(out: Path, name: str) -> NDArray[np.uint8]:
     """Return the mean of a view's four pictures as 8-bit sRGB, [H, W, 3]."""
-    files = view_files(out, name, ground_truth=False, raw=False)
+    files = view_files(out, name, ground_truth=False)
     mean = np.mean([_picture(file) for file in files], axis=0) / 65535
     colors = mean[..., ::-1] if mean.ndim == 3 else np.repeat(mean[..., None], 3, axis=2)
     return np.asarray(np.round(255 * srgb_encode_array(np.clip(colors, 0, 1))), np.uint8)

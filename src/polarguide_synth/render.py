@@ -32,6 +32,7 @@ from polarguide_synth.sensor import (
     FilterShot,
     LobeRadiance,
     Sensor,
+    exposure_suffix,
     filter_jpeg,
     mosaic,
     noisy,
@@ -101,12 +102,22 @@ class Plan:
         """True if the rendering also writes raw mosaics."""
         return self.settings.sensor in SENSORS
 
-    def photograph(self, number: int) -> tuple[FilterShot, Path] | None:
-        """Return the photograph of a view through a filter, and its file. Return None for other sensors."""
+    def photographs(self, number: int) -> list[tuple[FilterShot, Path]]:
+        """Return the exposures of the photograph of a view, and their files. Empty if the sensor is not ``filter``."""
         if self.settings.sensor != "filter":
-            return None
+            return []
         shot = plan_shot(self.settings.seed, number)
-        return shot, self.out / "raw" / f"{self.names[number]}_a{shot.body_angle}.jpg"
+        name = f"{self.names[number]}_a{shot.body_angle}"
+        stops = self.settings.stops
+        return [
+            (replace(shot, stops=shot.stops + stop), self.out / "raw" / f"{name}{suffix}.jpg")
+            for stop, suffix in zip(stops, exposure_suffix(stops), strict=True)
+        ]
+
+    def raw_mosaics(self, name: str) -> list[Path]:
+        """Return the files of the exposures of a view's mosaic. Empty for other sensors."""
+        suffixes = exposure_suffix(self.settings.stops) if self.mosaics else []
+        return [self.out / "raw" / f"{name}{suffix}.png" for suffix in suffixes]
 
     def has_ground_truth(self, name: str) -> bool:
         """Return True if the ground truth of a view is written."""
@@ -114,9 +125,9 @@ class Plan:
 
     def files(self, name: str) -> list[Path]:
         """Return the paths of all files of a view."""
-        files = folder.view_files(self.out, name, ground_truth=self.has_ground_truth(name), raw=self.mosaics)
-        photograph = self.photograph(self.names.index(name))
-        return files if photograph is None else [*files, photograph[1]]
+        files = folder.view_files(self.out, name, ground_truth=self.has_ground_truth(name))
+        photographs = [path for _, path in self.photographs(self.names.index(name))]
+        return [*files, *self.raw_mosaics(name), *photographs]
 
 
 @dataclass(frozen=True, eq=False)
@@ -246,8 +257,10 @@ def render_view(job: Job, number: int) -> None:
     light = render_lobes(job.built.scenes, big, samples, seed=settings.seed * 100003 + number, limits=limits)
     random = np.random.default_rng((settings.seed, 31, number))
     if job.mosaics:
-        raw = mosaic(light.stokes * job.exposure, settings.sensor, settings.noise, random, job.sensor)
-        write_png_file(job.out / "raw" / f"{name}.png", raw)
+        stokes = light.stokes * job.exposure
+        for stop, path in zip(settings.stops, job.raw_mosaics(name), strict=True):
+            raw = mosaic(stokes, settings.sensor, settings.noise, random, job.sensor, 2.0**stop)
+            write_png_file(path, raw)
         light = LobeRadiance(_halved(light.specular), _halved(light.diffuse), _halved(light.emitted))
     stokes = light.stokes * job.exposure
     if job.has_ground_truth(name):
@@ -258,15 +271,9 @@ def render_view(job: Job, number: int) -> None:
         data = io.BytesIO()
         np.savez_compressed(data, **arrays)
         folder.write_file(job.out / "gt" / f"{name}.npz", data.getvalue())
-    photograph = job.photograph(number)
-    if photograph is not None:
-        shot, path = photograph
-        folder.write_file(
-            path,
-            filter_jpeg(
-                stokes, camera.rays(dtype=torch.float64).numpy(), shot, settings.noise, random, job.sensor
-            ),
-        )
+    for shot, path in job.photographs(number):
+        rays = camera.rays(dtype=torch.float64).numpy()
+        folder.write_file(path, filter_jpeg(stokes, rays, shot, settings.noise, random, job.sensor))
     # Only the files of a simulated sensor contain noise. These pictures are their noise-free reference.
     noise = settings.noise if settings.sensor == "ideal" else 0.0
     write_view(
@@ -452,7 +459,8 @@ def _fewer_views(plan: Plan, out: Path, sweep: Sweep, reporter: Reporter, thread
 def _link(scene: Path, member: Path, names: list[str]) -> None:
     """Share the files of some views between two scenes, by hard links if the disk supports them."""
     for name in names:
-        for source in folder.view_files(scene, name, ground_truth=True, raw=True):
+        raw = (scene / "raw").glob(f"{name}[._]*")
+        for source in (*folder.view_files(scene, name, ground_truth=True), *raw):
             target = member / source.relative_to(scene)
             if source.exists() and not target.exists():
                 target.parent.mkdir(parents=True, exist_ok=True)

@@ -75,8 +75,13 @@ def noisy(intensity: Array, noise: float, random: np.random.Generator, sensor: S
     return np.asarray(counts / electrons)
 
 
+def exposure_suffix(stops: Sequence[float]) -> list[str]:
+    """Return the end of the file name of each exposure, such as ``_ev-3``. One normal exposure has an empty end."""
+    return [""] if tuple(stops) == (0.0,) else [f"_ev{stop:g}" for stop in stops]
+
+
 def mosaic(
-    stokes: Array, name: str, noise: float, random: np.random.Generator, sensor: Sensor
+    stokes: Array, name: str, noise: float, random: np.random.Generator, sensor: Sensor, light: float = 1.0
 ) -> NDArray[np.uint16]:
     """Return the raw mosaic [H, W] that a sensor stores.
 
@@ -88,16 +93,17 @@ def mosaic(
         noise: amount of noise, as for ``noisy``.
         random: generator of random numbers.
         sensor: parameters of the sensor.
+        light: exposure relative to the normal exposure.
     """
     pattern = sensor_pattern(name)
     angles = tiled(pattern.angles, stokes.shape[1:3])
     if pattern.colors is None:
-        light = stokes.mean(-1)
+        samples = stokes.mean(-1)
     else:
         colors = tiled(pattern.colors, stokes.shape[1:3])
-        light = np.take_along_axis(stokes, colors[None, ..., None], -1)[..., 0]
+        samples = np.take_along_axis(stokes, colors[None, ..., None], -1)[..., 0]
     contrast = (sensor.extinction - 1) / (sensor.extinction + 1)
-    value = malus((light[0], contrast * light[1], contrast * light[2]), np.radians(angles))
+    value = light * malus((samples[0], contrast * samples[1], contrast * samples[2]), np.radians(angles))
     value = noisy(value, noise, random, sensor) * np.array(sensor.gains)[angles // 45]
     top = (1 << sensor.bits) - 1
     return np.clip(np.round(sensor.black + value * (top - sensor.black)), 0, top).astype(np.uint16)

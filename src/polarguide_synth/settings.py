@@ -13,10 +13,12 @@ from typing import Annotated, Any, Literal
 
 from msgspec import Meta
 
+from polarguide.capture.exposure_files import LARGEST_STOPS
 from polarguide.capture.sensor.pattern import SENSORS, Sensor, any_case, sensor_named
 from polarguide.core.errors import optional_import, require
 from polarguide.core.options import picture_size
 from polarguide.core.records import check_options
+from polarguide.core.text import decimals
 from polarguide_synth.schema import SceneSpec, parse_scene, read_scene_file
 
 Color = Literal["rgb", "spectral"]
@@ -147,6 +149,7 @@ class SynthSettings:
             of each view, through a filter before an ordinary camera.
         noise: Photon and read noise. 1 simulates an exposure to full scale, 2 an exposure with a quarter of that light,
             0 no noise.
+        exposures: Exposures of each mosaic or photograph in stops, such as 0,-3,-6. By default, one normal exposure.
         color: Three channels with exact values, or a sampled spectrum.
         ground_truth: Views for which ground truth is written.
         points: Approximate number of sparse points.
@@ -161,6 +164,7 @@ class SynthSettings:
         any_case("ideal", *SENSORS, "filter"),
     ] = "ideal"
     noise: Annotated[float, Meta(ge=0, le=100)] = 0.0
+    exposures: str | None = None
     color: Color = "rgb"
     ground_truth: Literal["test", "all"] = "test"
     points: Annotated[int, Meta(ge=0)] = 5000
@@ -179,13 +183,21 @@ class SynthSettings:
         """Height of the pictures in pixels."""
         return picture_size(self.size)[1]
 
+    @property
+    def stops(self) -> tuple[float, ...]:
+        """Exposures of each file of the sensor in stops."""
+        return (0.0,) if self.exposures is None else decimals(self.exposures)
+
     def data(self) -> dict[str, Any]:
         """Return the settings as JSON data."""
         values = asdict(self)
         del values["size"]
         values["sensor"] = self.sensor.lower()  # as in requests of earlier versions
-        if self.test_every == TEST_EVERY:  # requests of earlier versions lack this setting
+        # Requests of earlier versions lack these settings.
+        if self.test_every == TEST_EVERY:
             del values["test_every"]
+        if self.exposures is None:
+            del values["exposures"]
         return {"width": self.width, "height": self.height, **values}
 
     def check(self) -> None:
@@ -196,6 +208,21 @@ class SynthSettings:
         """
         check_options(self)
         picture_size(self.size)
+        stops = self.stops
+        require(
+            0 < len(stops) == len(set(stops)) and all(abs(stop) <= LARGEST_STOPS for stop in stops),
+            "--exposures",
+            expected=f"different exposures in stops up to {LARGEST_STOPS:g}, such as 0,-3,-6",
+            found=repr(self.exposures),
+            remedy="Separate the numbers by commas.",
+        )
+        require(
+            self.exposures is None or self.sensor != "ideal",
+            "--exposures",
+            expected="a --sensor whose files are written, such as IMX250MYR or filter",
+            found="--sensor ideal",
+            remedy="Specify a sensor, and --noise 1 for sensor noise.",
+        )
 
 
 @dataclass(frozen=True)

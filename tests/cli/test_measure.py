@@ -7,6 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from bracketed import write_bracket
 from camera_files import write_mosaics
 
 from polarguide.cli.app import run
@@ -179,3 +180,14 @@ def test_pictures_that_options_do_not_fit(
     monkeypatch.chdir(tmp_path)
     cv2.imwrite("small.png", np.full((32, 32), 900, np.uint16))
     assert found in refused("measure", shots / "v000.png", "--out", "out", *options, *SENSOR)
+
+
+def test_measure_reads_brackets(tmp_path: Path) -> None:
+    write_bracket(tmp_path / "line", "part")
+    out = tmp_path / "out"
+    roi = "lamp=85,46,10,10"
+    assert measure(tmp_path / "line", "--out", out, "--black-level", "64", "--roi", roi) == 0
+    (values,) = rows_of(out)
+    assert values["shot"] == "part"
+    assert float(values["dolp_mean"]) == pytest.approx(0.4, abs=0.02)
+    assert float(values["s0_mean"]) > 10

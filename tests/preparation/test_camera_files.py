@@ -15,7 +15,13 @@ from PIL.TiffImagePlugin import IFDRational
 
 from polarguide.capture.calibration import Calibration
 from polarguide.capture.checks import measured_gains, pair_moments
-from polarguide.capture.develop import LinearShots, MosaicFiles, exposures_of_view, stated_exposures
+from polarguide.capture.develop import (
+    BracketedShots,
+    LinearShots,
+    MosaicFiles,
+    exposures_of_view,
+    stated_exposures,
+)
 from polarguide.capture.filter.camera_files import exif_data
 from polarguide.capture.filter.develop import align_shots, estimate_shifts
 from polarguide.capture.filter.encoding import (
@@ -220,7 +226,9 @@ def test_gains_of_a_calibration_are_not_measured_again():
     """Pair sums would take them for exposures, and the pictures would be divided by both."""
     gains = np.array([1.0, 1.15, 1.0, 1.0])
     light = np.repeat((0.6 * four() * gains[:, None, None])[..., None], 3, axis=3)
-    shots = LinearShots.of(stacked(np.rint(light * 65535).astype(np.uint16)), "linear", align=False)
+    shots = LinearShots.of(
+        BracketedShots.single(stacked(np.rint(light * 65535).astype(np.uint16))), "linear", align=False
+    )
     names = ["a", "b", "c", "d"]
     for calibration, exposures in ((Calibration(), gains), (Calibration(gains=(1, 1.15, 1, 1)), np.ones(4))):
         values, found, _ = shots.evenly_exposed(names, [1.0] * 4, PrepareSettings(calibration=calibration))

@@ -9,10 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 
-def mean_codes(codes: NDArray[np.uint16], factor: int) -> NDArray[np.uint16]:
-    """Average linear codes [H, W, C] uint16 over boxes, and round them to uint16, [H // K, W // K, C]."""
+def mean_codes(codes: NDArray[Any], factor: int) -> NDArray[Any]:
+    """Average linear codes [H, W, C] over boxes, [H // K, W // K, C]. The mean of uint16 codes is rounded to uint16."""
     if factor == 1:
         return codes
+    if codes.dtype.kind == "f":
+        return mean(codes, factor)
     parts = _strided(codes, factor)
     total = np.zeros(parts[0].shape, np.uint64)
     for part in parts:

@@ -135,9 +135,14 @@ def measure(codes: NDArray[np.uint16], usable: NDArray[np.bool_], *, four: bool 
 
 
 def top_histogram(raw: NDArray[Any]) -> NDArray[np.int64]:
-    """Count how often each stored value in the top 2 % of the range occurs. The last count is the largest value's."""
-    full = int(np.iinfo(raw.dtype).max)
+    """Count how often each stored value in the top 2 % of the range occurs. The last count is the largest value's.
+
+    Radiance has no largest value. Its counts are 0, in the range of 16-bit files.
+    """
+    full = FULL_CODE if raw.dtype.kind == "f" else int(np.iinfo(raw.dtype).max)
     low = full - int(full * CheckLimits.top_share)
+    if raw.dtype.kind == "f":
+        return np.zeros(full - low + 1, np.int64)
     return np.bincount(raw[raw >= low].astype(np.int64) - low, minlength=full - low + 1)
 
 

@@ -16,6 +16,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from polarguide.capture.brackets import (
+    NORMAL,
+    SINGLE,
+    Bracket,
+    MergedExposures,
+    Radiance,
+    measure_exposures,
+    merge,
+)
 from polarguide.capture.calibration import (
     UNIT_GAINS,
     Calibration,
@@ -53,9 +62,11 @@ from polarguide.capture.sensor.pattern import (
     level_notes,
     sensor_pattern,
     tiled,
+    unusable_samples,
 )
 from polarguide.capture.sensor.raw_file import RawFormat, read_mosaic, require_mosaic
 from polarguide.capture.view import FULL_CODE
+from polarguide.capture.view_reader import require_alike
 from polarguide.core.errors import PolarguideError
 from polarguide.core.files import require_file
 from polarguide.core.progress import Advance
@@ -237,30 +248,62 @@ class MosaicFiles:
         usable = np.asarray((values < levels.saturation).all(axis=(1, 2)) & (values > base).any(axis=(1, 2)))
         return pair_ratio(angles, usable), colors[:, usable]
 
-    def linear(
+    def merged(
         self,
-        values: NDArray[Any],
+        bracket: Bracket,
+        exposures: Sequence[NDArray[Any]],
         levels: Levels,
         dark: NDArray[np.float32] | None,
+        part: tuple[slice, slice] | None = None,
+    ) -> tuple[Radiance, NDArray[np.bool_]]:
+        """Convert the stored values of a mosaic to linear intensities, and merge its exposures.
+
+        Args:
+            bracket: files of the exposures.
+            exposures: stored values of each exposure after ``cut``, [H, W].
+            levels: levels of the stored values.
+            dark: dark frame [H, W], or None.
+            part: rows and columns of the result; default: all. The exposures are measured in the whole mosaic.
+
+        Returns:
+            The linear intensities [H, W]; and the mask of samples that are dark in all exposures.
+
+        Raises:
+            PolarguideError: the exposures contradict each other, see ``measure_exposures``.
+        """
+
+        def linear(
+            data: tuple[NDArray[Any], NDArray[np.float32] | None],
+        ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+            return levels.linear(*data), np.asarray(data[0] >= levels.saturation)
+
+        measured = measure_exposures(bracket, [(values, dark) for values in exposures], linear)
+        if part is not None:
+            exposures = [np.ascontiguousarray(values[part]) for values in exposures]
+            dark = None if dark is None else dark[part]
+        radiance = merge([(values, dark) for values in exposures], linear, measured)
+        black = [unusable_samples(values, levels, dark)[1] for values in exposures]
+        return radiance, np.logical_and.reduce(black)
+
+    def calibrated(
+        self,
+        linear: NDArray[np.float32],
         *masks: NDArray[np.bool_],
         corner: tuple[int, int] | None = None,
     ) -> tuple[NDArray[np.float32], tuple[NDArray[np.bool_], ...]]:
-        """Convert the stored values of a mosaic or a part of it to linear intensities, and apply the calibration.
+        """Apply the calibration to the linear intensities of a mosaic or a part of it.
 
         The calibration mixes the samples of a polarizer cell. If there is a calibration, masks of unusable samples are
         therefore extended to whole cells.
 
         Args:
-            values: stored values after ``cut``, [H, W].
-            levels: levels of the stored values.
-            dark: dark frame [H, W], or None.
+            linear: linear intensities [H, W].
             masks: masks of unusable samples, [H, W] each.
             corner: column and row of the sensor at which the part starts; default: ``corner`` of the reader.
 
         Returns:
             The linear intensities [H, W], and the masks.
         """
-        linear = levels.linear(values, dark)
         if self.analyzers is None:
             return linear, masks
         return self.analyzers.apply(linear, offset=corner or self.corner), tuple(map(spread_to_cells, masks))
@@ -594,11 +637,47 @@ def levels_of_pictures(
 
 
 @dataclass(frozen=True, eq=False)
+class BracketedShots:
+    """Stored pixels of the K shots of a view at E exposures.
+
+    Attributes:
+        bracket: files of the exposures.
+        shots: stored pixels at each exposure.
+    """
+
+    bracket: Bracket
+    shots: Sequence[Shots]
+
+    @classmethod
+    def single(cls, shots: Shots) -> BracketedShots:
+        """Use shots with one exposure."""
+        return cls(SINGLE, [shots])
+
+    @classmethod
+    def read(
+        cls,
+        paths: Sequence[Path],
+        gains: tuple[float, float, float] = (1.0, 1.0, 1.0),
+        levels: Levels | None = None,
+    ) -> BracketedShots:
+        """Read all exposures of the shots that some files represent. ``read_stack`` describes the arguments.
+
+        Raises:
+            PolarguideError: a file cannot be read, or files differ in size, depth, orientation or exposures.
+        """
+        bracket = Bracket.of(paths)
+        shots = [read_stack(files, gains, levels) for files in bracket.files]
+        for files, others in zip(bracket.files, shots, strict=True):
+            require_alike(files[0], others.pictures[0], bracket.files[0][0], shots[0].pictures[0])
+        return cls(bracket, shots)
+
+
+@dataclass(frozen=True, eq=False)
 class LinearShots:
     """Linear intensities of the K shots of a view. If there are four shots, they may be aligned.
 
     Attributes:
-        values: linear intensities, [K, H, W, 3]; full scale is 1.
+        values: linear intensities, [K, H, W, 3]; full scale of the normal exposure is 1.
         saturated: mask of the pixels that are saturated in some shot, [H, W].
         dark: mask of the pixels that are 0 in all shots, [H, W].
         outside: mask of the pixels that are outside the picture of some shot after the alignment, [H, W].
@@ -606,6 +685,7 @@ class LinearShots:
         orientation: EXIF orientation of the shots.
         clipped_share: share of the saturated pixels before the alignment.
         dark_share: share of the dark pixels before the alignment.
+        exposures: exposures that were merged.
     """
 
     values: NDArray[np.float32]
@@ -616,6 +696,7 @@ class LinearShots:
     orientation: int
     clipped_share: float
     dark_share: float
+    exposures: MergedExposures = NORMAL
 
     @property
     def invalid(self) -> NDArray[np.bool_]:
@@ -623,20 +704,37 @@ class LinearShots:
         return self.saturated | self.dark | self.outside
 
     @classmethod
-    def of(cls, shots: Shots, transfer: str, *, align: bool) -> LinearShots:
-        """Convert the stored values of shots to linear intensities, and correct shifts of the shots if ``align``."""
-        values = linear_codes(shots.pictures, transfer).astype(np.float32) / np.float32(FULL_CODE)
-        shifts = estimate_shifts(values) if align else [Shift(0.0, 0.0, True)] * len(values)
-        values, (saturated, dark), outside = align_shots(values, (shots.clipped, shots.dark), shifts)
+    def of(cls, exposures: BracketedShots, transfer: str, *, align: bool) -> LinearShots:
+        """Convert the stored values of shots to linear intensities, and merge their exposures.
+
+        Shifts of the shots are corrected if ``align``.
+
+        Raises:
+            PolarguideError: the exposures contradict each other, see ``measure_exposures``.
+        """
+
+        def linear(shots: Shots) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+            codes = linear_codes(shots.pictures, transfer)
+            return codes.astype(np.float32) / np.float32(FULL_CODE), shots.clipped
+
+        measured = measure_exposures(exposures.bracket, exposures.shots, linear)
+        radiance = merge(exposures.shots, linear, measured)
+        values = radiance.values
+        clipped = radiance.clipped
+        no_light = np.logical_and.reduce([shots.dark for shots in exposures.shots])
+        # Highlights must not dominate the correlation of the shots.
+        shifts = estimate_shifts(np.minimum(values, 1.0)) if align else [Shift(0.0, 0.0, True)] * len(values)
+        values, (saturated, dark), outside = align_shots(values, (clipped, no_light), shifts)
         return cls(
             values,
             saturated,
             dark,
             outside,
             shifts,
-            shots.orientation,
-            float(shots.clipped.any(axis=0).mean()),
-            float(shots.dark.mean()),
+            exposures.shots[0].orientation,
+            float(clipped.any(axis=0).mean()),
+            float(no_light.mean()),
+            radiance.exposures,
         )
 
     def evenly_exposed(

@@ -184,8 +184,10 @@ def _some(view: View, *places: int, known: bool = True) -> View:
 def _computed(view: View, pictures: Callable[[View], list[Tensor]], exposures: tuple[Exposure, ...]) -> View:
 
     def change(codes: Tensor) -> Tensor:
-        new = torch.stack(pictures(replace(view, pictures=codes, gains=EVEN))).clamp(0, 1) * FULL_CODE
-        return new.round().to(torch.int32).to(torch.uint16)
+        new = torch.stack(pictures(replace(view, pictures=codes, gains=EVEN))).clamp(min=0) * FULL_CODE
+        if codes.dtype == torch.float32:
+            return new
+        return new.clamp(max=FULL_CODE).round().to(torch.int32).to(torch.uint16)
 
     return view.changed(change, exposures)
 

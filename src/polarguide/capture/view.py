@@ -161,7 +161,7 @@ class View:
         """Linear intensities of the K pictures as 16-bit codes ``round(65535 * intensity)``, [K, H, W, 3] uint16, RGB.
 
         ``exposures`` has the angle of each picture, usually 0, 45, 90 and 135 degrees. Codes take half the memory of
-        floating-point numbers.
+        floating-point numbers. Radiance above full scale, as from merged exposures, has float32 codes in the same unit.
 
         Raises:
             PolarguideError: a file of the view was changed or deleted.
@@ -260,7 +260,7 @@ class View:
     def intensities(self) -> Tensor:
         """Return the linear intensities of the K pictures, divided by their gains, [K, H, W, 3] float32.
 
-        The values are in [0, 1] if all gains are 1.
+        The values are in [0, 1] if all gains are 1. Merged exposures have larger values.
         """
         intensities = self._even(self.codes.to(torch.float32) / FULL_CODE)
         gains = [exposure.gain for exposure in self.exposures]

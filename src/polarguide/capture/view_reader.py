@@ -21,6 +21,7 @@ from polarguide.capture.exposures import FOUR, LARGEST, Angle, Exposure, normali
 from polarguide.capture.formats.headers import declared_size
 from polarguide.capture.formats.pictures import (
     MATERIAL_REMEDY,
+    codes_of_floats,
     decode_mask,
     decode_materials,
     decode_picture,
@@ -238,7 +239,7 @@ class ViewData:
 
     name: str
     size: tuple[int, int]
-    codes: NDArray[np.uint16]
+    codes: NDArray[Any]
     peak: NDArray[Any]
     black: NDArray[np.bool_]
     histogram: NDArray[np.int64]
@@ -257,7 +258,19 @@ class ViewData:
         Args:
             scale: stored value at which pixels are saturated; None if no pixel of the capture is saturated.
         """
-        return self.black if scale is None else np.asarray(self.black | (self.peak >= scale))
+        return (
+            self.black if scale is None or self.is_radiance else np.asarray(self.black | (self.peak >= scale))
+        )
+
+    @property
+    def is_radiance(self) -> bool:
+        """True if the pictures are floating-point radiance, whose values above full scale are not saturated."""
+        return self.peak.dtype == np.float32
+
+    @property
+    def largest_value(self) -> int:
+        """Largest value that the files can store, 255 or 65535. Radiance counts as 16-bit files."""
+        return FULL_CODE if self.is_radiance else int(np.iinfo(self.peak.dtype).max)
 
     def view(
         self,
@@ -333,7 +346,9 @@ class ViewFiles:
     def _read_codes(self, name: str) -> Tensor:
         return torch.from_numpy(
             _codes(
-                _read_pictures(Files(self._digests), self._layout.files(name)), self._transfer, self._factor
+                _read_pictures(Files(self._digests), self._layout.files(name), self._transfer),
+                self._transfer,
+                self._factor,
             )
         )
 
@@ -372,7 +387,7 @@ def read_view(
         PolarguideError: a file is damaged, or the sizes of the files differ.
     """
     files = Files()
-    raw = _read_pictures(files, layout.files(name))
+    raw = _read_pictures(files, layout.files(name), transfer)
     height, width = raw[0].shape[:2]
     require_factor(factor, height, width)
     optional = {
@@ -434,7 +449,7 @@ def view_data(
 
     Args:
         name: name of the view.
-        raw: stored pictures, [H, W, 3] each, all uint8 or all uint16.
+        raw: stored pictures, [H, W, 3] each, all uint8, all uint16, or all float32 in units of full scale.
         exposures: polarizer angle and gain of each picture.
         factor: side of the boxes.
         transfer: encoding of the pictures.
@@ -481,22 +496,37 @@ def check_materials(layout: CaptureFiles, views: Iterable[ViewData], indices: Ma
             )
 
 
-def _codes(raw: Sequence[NDArray[Any]], transfer: str, factor: int) -> NDArray[np.uint16]:
+def _codes(raw: Sequence[NDArray[Any]], transfer: str, factor: int) -> NDArray[Any]:
     """Convert stored pictures to linear codes, and average them over boxes of ``factor`` x ``factor`` pixels."""
     return np.stack([boxes.mean_codes(linear_codes(pixels, transfer), factor) for pixels in raw])
 
 
-def _read_pictures(files: Files, paths: list[Path]) -> list[NDArray[Any]]:
-    """Read the pictures of a view, [H, W, 3] each, and check that they have the same size and bit depth."""
+def _read_pictures(files: Files, paths: list[Path], transfer: str) -> list[NDArray[Any]]:
+    """Read the pictures of a view, [H, W, 3] each, and check that they have the same size and bit depth.
+
+    Floating-point pictures are linear radiance if one of them has values above 1. Otherwise they become 16-bit codes,
+    whose largest value marks saturated pixels.
+    """
     pictures: list[NDArray[Any]] = []
     for path in paths:
         data = files.picture(path)
         if pictures:
             require_size(path, data, pictures[0].shape[:2], like=paths[0])
-        picture = decode_picture(path, data)
+        picture = decode_picture(path, data, keep_floats=True)
         if pictures:
             require_alike(path, picture, paths[0], pictures[0])
         pictures.append(picture)
+    if pictures[0].dtype != np.float32:
+        return pictures
+    if all(picture.max() <= 1 for picture in pictures):
+        return [codes_of_floats(picture) for picture in pictures]
+    require(
+        transfer == "linear",
+        paths[0],
+        expected="transfer linear for pictures with values above full scale",
+        found=transfer,
+        remedy="Remove the option.",
+    )
     return pictures
 
 
@@ -594,15 +624,15 @@ class StoredViews:
         Raises:
             PolarguideError: the views differ in bit depth.
         """
-        first = {item.peak.dtype.itemsize: item.name for item in reversed(data)}
+        first = {item.largest_value: item.name for item in reversed(data)}
         if len(first) > 1:
             raise PolarguideError(
                 "pictures",
                 expected="the same bit depth in all views",
-                found=f"8 bits in view {first[1]} and 16 bits in view {first[2]}",
+                found=f"8 bits in view {first[255]} and 16 bits in view {first[FULL_CODE]}",
                 remedy="Save all pictures with the same bit depth.",
             )
-        largest_value = int(np.iinfo(data[0].peak.dtype).max)
+        largest_value = data[0].largest_value
         scale = checks.full_scale(np.sum([item.histogram for item in data], axis=0), largest_value)
         measures = [
             checks.measure(item.codes, ~(item.invalid | item.saturated(scale)), four=item.exposures == FOUR)
@@ -617,7 +647,10 @@ class StoredViews:
         """Return warnings about the exposure, encoding and order of the pictures."""
         names = [item.name for item in self.data]
         scale = self.full_scale
-        blown = [0.0 if scale is None else float((item.peak >= scale).mean()) for item in self.data]
+        blown = [
+            0.0 if scale is None or item.is_radiance else float((item.peak >= scale).mean())
+            for item in self.data
+        ]
         warnings = checks.exposure_warnings(
             names, self.measures, blown, max(int(item.peak.max()) for item in self.data), self.largest_value
         )

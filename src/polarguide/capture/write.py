@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import io
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+import tifffile
 from numpy.typing import NDArray
 
 from polarguide.capture.exposures import Angle, angle_labels
@@ -44,6 +46,19 @@ def rounding_of(values: NDArray[np.floating[Any]]) -> list[tuple[int, int]]:
     return list(zip(starts.tolist(), multiples[changes].tolist(), strict=True))
 
 
+RADIANCE_SUFFIX = ".tif"
+"""Suffix of pictures that hold linear radiance as floating-point numbers."""
+_SIGNIFICANT_BITS = 14
+"""Number of significant bits of stored radiance. The error is less than a fifth of a step of a 12-bit sensor."""
+
+
+def rounded_radiance(intensities: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Round radiance to 14 significant bits, so that files become smaller."""
+    mantissa, exponent = np.frexp(intensities)
+    scale = np.float32(1 << _SIGNIFICANT_BITS)
+    return np.asarray(np.ldexp(np.rint(mantissa * scale) / scale, exponent), np.float32)
+
+
 def intensity_codes(
     intensities: NDArray[np.float32], invalid: NDArray[np.bool_], rounding: Rounding = EXACT
 ) -> NDArray[np.uint16]:
@@ -68,15 +83,21 @@ def picture_name(view: str, angle: int) -> str:
     return f"polar/{view}_{angle:03d}.png"
 
 
-def picture_names(view: str, angles: Sequence[Angle] = ANGLES) -> list[str]:
+def picture_names(view: str, angles: Sequence[Angle] = ANGLES, suffix: str = ".png") -> list[str]:
     """Return the paths of a view's pictures in its scene folder."""
-    return [f"polar/{view}_{label}.png" for label in angle_labels(angles)]
+    return [f"polar/{view}_{label}{suffix}" for label in angle_labels(angles)]
+
+
+def suffix_of(files: Iterable[str]) -> str:
+    """Return the suffix of the pictures among the files of a view in a scene folder."""
+    radiance = any(name.endswith(RADIANCE_SUFFIX) for name in files)
+    return RADIANCE_SUFFIX if radiance else ".png"
 
 
 def write_view(
     root: Path,
     view: str,
-    codes: NDArray[np.uint16],
+    codes: NDArray[np.uint16] | NDArray[np.float32],
     invalid: NDArray[np.bool_] | None = None,
     mask: NDArray[np.bool_] | None = None,
     angles: Sequence[Angle] = ANGLES,
@@ -86,8 +107,8 @@ def write_view(
     Args:
         root: scene folder.
         view: name of the view.
-        codes: linear 16-bit codes of the pictures, [K, H, W, 3] RGB. If all three channels are equal, one channel is
-            written.
+        codes: linear 16-bit codes of the pictures, [K, H, W, 3] RGB. Floating-point numbers are linear radiance, which
+            is written to TIFF files. If all three channels are equal, one channel is written.
         invalid: mask of unusable pixels, [H, W].
         mask: foreground mask, [H, W].
         angles: angles of the pictures.
@@ -100,14 +121,15 @@ def write_view(
     """
     if (codes == codes[..., :1]).all():
         codes = codes[..., 0]
-    files: dict[str, NDArray[Any]] = dict(zip(picture_names(view, angles), codes, strict=True))
+    suffix = ".png" if codes.dtype == np.uint16 else RADIANCE_SUFFIX
+    files: dict[str, NDArray[Any]] = dict(zip(picture_names(view, angles, suffix), codes, strict=True))
     for folder, pixels in (("invalid", invalid), ("masks", mask)):
         if pixels is not None:
             files[f"{folder}/{view}.png"] = pixels.astype(np.uint8) * 255
     with ThreadPoolExecutor(
         min(len(files), os.cpu_count() or 1)
     ) as pool:  # compression takes most of the time
-        encoded = list(pool.map(_png_data, (root / name for name in files), files.values()))
+        encoded = list(pool.map(_picture_data, (root / name for name in files), files.values()))
     return {name: _write(root / name, data) for name, data in zip(files, encoded, strict=True)}
 
 
@@ -122,6 +144,16 @@ def write_png_file(path: Path, pixels: NDArray[Any]) -> int:
         PolarguideError: the file cannot be written.
     """
     return _write(path, _png_data(path, pixels))
+
+
+def _picture_data(path: Path, pixels: NDArray[Any]) -> bytes:
+    """Encode floating-point pixels as TIFF, and whole numbers as PNG."""
+    if pixels.dtype.kind != "f":
+        return _png_data(path, pixels)
+    data = io.BytesIO()
+    photometric = "rgb" if pixels.ndim == 3 else "minisblack"
+    tifffile.imwrite(data, pixels, photometric=photometric, compression="zlib", predictor=True, metadata=None)
+    return data.getvalue()
 
 
 def _png_data(path: Path, pixels: NDArray[Any]) -> bytes:

@@ -47,9 +47,7 @@ def train_scene(
 ) -> None:
     """Train a recipe on a scene.
 
-    Ctrl-C stops the training and saves its state; --resume continues to the same result. Several processes share the
-    views
-    of each step: torchrun --nproc-per-node N --no-python polarguide train ...
+    Ctrl-C stops the training and saves its state; --resume continues to the same result.
 
     Args:
         scene: Scene folder: polar/<view>_000|_045|_090|_135.png or four folders I-00 I-45 I-90 I-135, and a COLMAP
@@ -76,7 +74,7 @@ def train_scene(
             )
         except KeyboardInterrupt as stopped:
             if str(stopped):  # a requested stop; the text names the last step
-                say(f"{stopped}; go on with the same command and --resume")
+                say(f"{stopped}; the same train command and --resume continue")
             raise
     say(f"trained: {out}   next: {command('eval', out)}   {command('view', out)}")
 
@@ -385,14 +383,14 @@ def export_run(
     """Export a run to the file formats of other programs.
 
     Splats (ply, spz, sog, splat-glb, splat-usdz) have reflections baked into harmonics. The mesh (GLB and PLY) is fused
-    from rendered depth and has diffuse colors and learned normals. The textured model (glb, obj, usdz) is for Blender,
-    game engines and viewers. Its base color has no highlights and no shading. Its closed surface (stl) is for 3D
-    printing. The points are opaque Gaussians with normals. The environment is the learned light as a panorama (EXR, HDR
-    and PNG). The cameras are a COLMAP model and transforms.json. The choice all is a package of most of these.
+    from rendered depth and has diffuse colors and learned normals. The textured model (glb, usdz) is for Blender, game
+    engines and viewers. Its base color has no highlights and no shading. Its closed surface (stl) is for 3D printing.
+    The environment is the learned light as a panorama (EXR, HDR and PNG). The cameras are a COLMAP model and
+    transforms.json. The choice all is a package of most of these.
 
     Args:
         run: Run folder.
-        format: ply, spz, sog, splat-glb, splat-usdz, mesh, glb, obj, usdz, stl, points, environment, cameras or all.
+        format: ply, spz, sog, splat-glb, splat-usdz, mesh, glb, usdz, stl, environment, cameras or all.
         out: Folder to write; default: RUN/export.
         resolution: Voxels of the mesh along its longest side.
         spz_version: Version of the SPZ file; programs support only one of the two.

@@ -31,10 +31,8 @@ ExportFormat = Literal[
     "splat-usdz",
     "mesh",
     "glb",
-    "obj",
     "usdz",
     "stl",
-    "points",
     "environment",
     "cameras",
     "all",
@@ -46,7 +44,7 @@ PictureFormat = Literal["png", "exr", "npy"]
 EXPORT_PACKAGES: dict[str, tuple[str, ...]] = {
     "spz": ("gaussforge",),
     "mesh": ("skimage",),
-    **dict.fromkeys(("glb", "obj"), ("skimage", "xatlas", "fast_simplification")),
+    "glb": ("skimage", "xatlas", "fast_simplification"),
     "all": ("gaussforge", "skimage", "xatlas", "fast_simplification"),
     "usdz": ("pxr", "skimage", "xatlas", "fast_simplification"),
     "splat-usdz": ("pxr",),
@@ -204,7 +202,7 @@ class SceneOptions:
 
 @dataclass(frozen=True)
 class ModelOptions:
-    """Options of a textured model (formats glb, obj and usdz) or of its surface (stl).
+    """Options of a textured model (formats glb and usdz) or of its surface (stl).
 
     Attributes:
         triangles: Approximate number of triangles of the simplified surface.

@@ -49,12 +49,12 @@ class InspectedView:
 
     Attributes:
         name: name of the view.
-        codes: linear intensities as in ``View.codes``, [K, H, W, 3] uint16.
+        codes: linear intensities as in ``View.codes``, [K, H, W, 3].
         invalid: mask of invalid pixels as in ``View``, [H, W] bool.
         saturated: mask of saturated pixels as in ``View``, [H, W] bool.
         black: mask of pixels that are 0 in all pictures. These pixels are also in ``saturated``.
         camera: camera at the size of ``codes``, or None.
-        peak: largest stored value.
+        peak: largest stored value, in units of 16-bit codes for radiance.
         exposures: exposures of the pictures.
     """
 
@@ -68,7 +68,10 @@ class InspectedView:
     exposures: tuple[Exposure, ...] = FOUR
 
     def intensities(self) -> Tensor:
-        """Return linear intensities in [0, 1] at the stated angles, [K, H, W, 3] float32."""
+        """Return linear intensities at the stated angles, [K, H, W, 3] float32.
+
+        They are in [0, 1] unless the pictures are merged exposures.
+        """
         return self.codes.to(torch.float32) / FULL_CODE
 
     @property
@@ -205,7 +208,7 @@ def _inspected_view(item: ViewData, camera: Camera | None, full_scale: int | Non
         saturated=torch.from_numpy(item.saturated(full_scale)),
         black=torch.from_numpy(item.black),
         camera=camera,
-        peak=int(item.peak.max()),
+        peak=int(item.codes.max()) if item.is_radiance else int(item.peak.max()),
         exposures=item.exposures,
     )
 

@@ -48,6 +48,7 @@ class PictureLimits:
         sure_bend: number of standard errors from which a curvature is significant. See ``AngleLimits.sure``.
         not_dielectric: share of pixels above which the check warns. It refers to pixels with normals if there are any,
             else to all pixels.
+        darkest: percentile of the brightness at which the dynamic range starts. Darker pixels are noise.
     """
 
     pair_error = 0.05
@@ -65,6 +66,7 @@ class PictureLimits:
     bent = 0.18
     sure_bend = 4.0
     not_dielectric = 0.15
+    darkest = 1.0
 
 
 def find_pairing(capture: Capture) -> int | None:
@@ -243,6 +245,7 @@ def _saturation(capture: Capture, measurements: Sequence[ViewMeasurements]) -> C
         f"{np.mean(shares):.1%} of the pixels are at full scale, at most {max(shares):.1%} in a view; "
         f"{invalid:.1%} are marked invalid, {dark:.1%} are too dark to be used."
     )
+    finding += _range_text(capture, largest)
     outcome = first_outcome(
         (
             unscaled,
@@ -264,6 +267,21 @@ def _saturation(capture: Capture, measurements: Sequence[ViewMeasurements]) -> C
         *outcome,
         off,
         {"saturated": float(np.mean(shares)), "worst": max(shares), "invalid": invalid, "dark": dark},
+    )
+
+
+def _range_text(capture: Capture, largest: int) -> str:
+    """Return a sentence on the dynamic range of merged exposures, or an empty text if no value exceeds full scale."""
+    if largest <= FULL_CODE:
+        return ""
+    bright = np.concatenate(
+        [view.intensities().mean(dim=(0, 3))[view.usable].numpy().ravel() for view in capture.views]
+    )
+    dark, high = np.percentile(bright, (PictureLimits.darkest, 100.0))
+    stops = math.log2(max(high, 1e-12) / max(dark, 1e-12))
+    return (
+        f" Usable pixels cover {stops:.1f} stops between their 1st percentile and the brightest one. The largest value "
+        f"is {largest / FULL_CODE:.1f} times full scale; pixels that clip in every exposure are marked invalid."
     )
 
 

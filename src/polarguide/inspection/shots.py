@@ -234,7 +234,7 @@ def agreement_checks(capture: Capture) -> list[Check]:
         files = capture.layout.files(view.name)
         samples = SetSamples(
             labels=tuple(files[k].name for k in places),
-            values=view.codes[places].numpy(),
+            values=view.intensities()[places].numpy(),
             exposures=exposures,
             lost=np.broadcast_to(view.saturated.numpy(), (len(places), *view.saturated.shape)),
             dark=view.black.numpy(),

@@ -17,11 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polarguide.capture.angle_evidence import TO_DEVIATION
+from polarguide.capture.brackets import Bracket, MergedExposures, bracket_notes
 from polarguide.capture.calibration import LARGEST_IMBALANCE, pair_ratio
 from polarguide.capture.colmap.model import read_model
 from polarguide.capture.colmap.poses import Geometry
 from polarguide.capture.develop import (
     COMPARABLE,
+    BracketedShots,
     LinearShots,
     as_displayed,
     exposure_notes,
@@ -31,6 +33,7 @@ from polarguide.capture.develop import (
     require_one,
     stated_exposures,
 )
+from polarguide.capture.exposure_files import all_exposures
 from polarguide.capture.exposures import TABLE, Angle, angle_text, turned
 from polarguide.capture.filter.camera_files import (
     Lens,
@@ -66,7 +69,7 @@ from polarguide.capture.point_exposures import (
 )
 from polarguide.capture.sensor.pattern import Levels
 from polarguide.capture.view import ANGLES, FULL_CODE, listed
-from polarguide.capture.write import EXACT, picture_names, rounding_of
+from polarguide.capture.write import EXACT, picture_names, rounding_of, suffix_of
 from polarguide.core.errors import PolarguideError, PolarguideWarning
 from polarguide.core.files import write_whole
 from polarguide.core.progress import Advance, Reporter
@@ -77,6 +80,7 @@ from polarguide.preparation.journal import (
     Measured,
     StoredRounding,
     ViewRecord,
+    stops_record,
 )
 from polarguide.preparation.settings import FilterSettings, SinglesSettings, white_gains
 from polarguide.preparation.source import DevelopedView, Source, Stored
@@ -181,7 +185,7 @@ class ShotsSource(Source):
         """
         require_memory_of_each(
             self._shots,
-            max(map(len, self._of_view.values())) * _WORKED,
+            max(map(len, map(all_exposures, self._of_view.values()))) * _WORKED,
             what,
             remedy="Make all pictures smaller by the same factor.",
         )
@@ -228,10 +232,22 @@ class ShotsSource(Source):
 
     def _linear(self, view: str, measured: ShotsMeasured, *, align: bool) -> LinearShots:
         """Return the linear shots of a view. They are aligned if ``align`` is True."""
-        shots = read_stack(self._of_view[view], self._white, measured.levels)
+        return self._merged(view, measured.levels, measured.transfer, align=align)
+
+    def _merged(self, view: str, levels: Levels | None, transfer: str, *, align: bool) -> LinearShots:
+        read = BracketedShots.read(self._of_view[view], self._white, levels)
         if self.used_as_stored(view):
-            shots = replace(shots, orientation=1)
-        return LinearShots.of(shots, measured.transfer, align=align)
+            read = replace(read, shots=[replace(shots, orientation=1) for shots in read.shots])
+        return LinearShots.of(read, transfer, align=align)
+
+    def _merged_exposures(self, levels: Levels | None, transfer: str) -> list[MergedExposures]:
+        """Merge the exposures of each view that has several ones, so that faults are found before any work is done.
+
+        Raises:
+            PolarguideError: the exposures of a view contradict each other.
+        """
+        several = [view for view in self.views if not Bracket.of(self._of_view[view]).single]
+        return [self._merged(view, levels, transfer, align=False).exposures for view in several]
 
     def _view(
         self,
@@ -252,6 +268,7 @@ class ShotsSource(Source):
                 clipped_share=round(shots.clipped_share, 6),
                 dark_share=round(shots.dark_share, 6),
                 invalid_share=round(float(invalid.mean()), 6),
+                stops=stops_record(shots.exposures),
                 geometry=Geometry((width, height), (0, 0), 1, (width, height)),
                 **measurements,
             ),
@@ -278,14 +295,19 @@ class FilterSource(ShotsSource):
             fault = f"{root} contains pictures without an angle in their names, or at other angles than 0, 45, 90, 135"
             warnings.warn(f"{fault}. They are not used ({listed(unused)}).", PolarguideWarning, stacklevel=2)
         views = {view: [files[angle] for angle in ANGLES] for view, files in sorted(shots.items())}
-        super().__init__([path for files in views.values() for path in files], views, settings)
+        super().__init__(all_exposures([path for files in views.values() for path in files]), views, settings)
+
+    @property
+    def description(self) -> str:
+        """Number of views and of shots."""
+        return f"{len(self.views)} views, each with shots at 0, 45, 90 and 135 degrees ({len(self._shots)} pictures)"
 
     def measure(self, advance: Advance) -> ShotsMeasured:
         """Measure the levels, the transfer function and the exposures of the capture."""
         self._require_memory("four shots")
         settings = self._settings
         gains = settings.calibration.gains
-        levels, level_notes = levels_of_pictures(self._shots, self._white, self._settings)
+        levels, level_notes = levels_of_pictures(all_exposures(self._shots), self._white, self._settings)
         decision = self._decide_transfer(levels)
         stated, missing = stated_exposures(self._of_view, advance) if settings.gains != "none" else ({}, "")
         # One scale for all shots, with headroom for the largest gain that is corrected.
@@ -294,7 +316,9 @@ class FilterSource(ShotsSource):
         scale /= settings.calibration.peak
         smallest = scale / (max(gains) if gains is not None else 1.0 / headroom)
         every = [value for values in stated.values() for value in values] or [1.0]
+        merged = self._merged_exposures(levels, decision.transfer)
         return ShotsMeasured(
+            bracketed=bool(merged),
             transfer="srgb" if decision.transfer == "srgb" else "linear",
             scale=scale * min(1.0, *every),
             rounding=self._rounding(decision.transfer, smallest * min(1.0, *every) / max(1.0, *every)),
@@ -309,6 +333,7 @@ class FilterSource(ShotsSource):
                 *level_notes,
                 decision.note,
                 *([missing] if missing else exposure_notes(stated)),
+                *bracket_notes(merged),
             ],
         )
 
@@ -328,12 +353,14 @@ class FilterSource(ShotsSource):
         invalid = shots.invalid
         ratio = pair_ratio(linear.mean(axis=3), ~invalid)
         gains, notes = pair_gains(ratio, settings, _GAINS if settings.gains == "auto" else {})
-        # Measured gains can exceed the stated ones. Values above full scale then count as clipped.
         linear = linear * np.asarray(measured.scale / np.asarray(gains), np.float32)[:, None, None, None]
-        invalid = invalid | (linear > 1.0).any(axis=(0, 3))
+        if not measured.bracketed:
+            # Measured gains can exceed the stated ones. Values above full scale then count as clipped.
+            invalid = invalid | (linear > 1.0).any(axis=(0, 3))
+            linear = np.minimum(linear, 1.0)
         return self._view(
             shots,
-            as_displayed(np.minimum(linear, 1.0), settings.calibration, shots.orientation),
+            as_displayed(linear, settings.calibration, shots.orientation),
             invalid,
             [*shift_notes(view, shots.shifts), *(f"{view}: {note}" for note in notes)],
             shifts=[(shift.x, shift.y) for shift in shots.shifts],
@@ -362,7 +389,19 @@ class SinglesSource(ShotsSource):
         for shot in shots:
             self._singles.setdefault(shot.view, []).append(shot)
         files = {view: [shot.path for shot in group] for view, group in sorted(self._singles.items())}
-        super().__init__([*itertools.chain(*files.values()), *tables], files, settings)
+        super().__init__([*all_exposures([*itertools.chain(*files.values())]), *tables], files, settings)
+
+    @property
+    def description(self) -> str:
+        """Number of photographs and their angles."""
+        angles = {shot.angle for shots in self._singles.values() for shot in shots}
+        if angles == {"none"}:
+            return f"{len(self._shots)} photographs without a polarizing filter"
+        texts = sorted(map(angle_text, angles), key=lambda text: (len(text), text))
+        return (
+            f"{len(self.views)} views, {len(self._shots)} photographs through a polarizing filter "
+            f"(angles: {listed(texts)})"
+        )
 
     def measure(self, advance: Advance) -> ShotsMeasured:
         """Measure the levels and the transfer function of the capture, and read the exposures that files state.
@@ -386,18 +425,27 @@ class SinglesSource(ShotsSource):
             "photographs of one kind of file",
             COMPARABLE,
         )
-        levels, level_notes = levels_of_pictures(self._shots, self._white, self._settings)
+        levels, level_notes = levels_of_pictures(all_exposures(self._shots), self._white, self._settings)
         decision = self._decide_transfer(levels)
         stated, missing = light_of_files(self._of_view, advance)
         light = {self._name(path): value for path, value in stated.items()}
         stating = f"{'All' if light else 'None'} of {len(self._shots)} files state their exposure (EXIF)."
+        merged = self._merged_exposures(levels, decision.transfer)
         return ShotsMeasured(
+            bracketed=bool(merged),
             transfer="srgb" if decision.transfer == "srgb" else "linear",
             scale=1.0,
             rounding=self._rounding(decision.transfer, 1.0),
             levels=levels,
             light=light,
-            notes=[*self.assumed, self._summary(), decision.note, *level_notes, missing or stating],
+            notes=[
+                *self.assumed,
+                self._summary(),
+                decision.note,
+                *level_notes,
+                missing or stating,
+                *bracket_notes(merged),
+            ],
         )
 
     def develop(self, view: str, measured: ShotsMeasured) -> DevelopedView:
@@ -563,7 +611,7 @@ def write_exposure_table(
         PictureRow(view, Path(name).name, exposure)
         for view, record in sorted(views.items())
         for name, exposure in zip(
-            picture_names(view, [shot.angle for shot in record.exposures or ()]),
+            picture_names(view, [shot.angle for shot in record.exposures or ()], suffix_of(record.files)),
             record.exposures or (),
             strict=True,
         )

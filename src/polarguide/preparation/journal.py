@@ -16,6 +16,7 @@ from typing import Annotated, Any, Generic, TypeVar
 import msgspec
 from msgspec import UNSET, Meta, UnsetType
 
+from polarguide.capture.brackets import MergedExposures
 from polarguide.capture.colmap.poses import Geometry
 from polarguide.capture.exposures import Angle
 from polarguide.capture.view import FULL_CODE
@@ -38,9 +39,11 @@ class Measured(msgspec.Struct, kw_only=True):
     Attributes:
         notes: messages for the user.
         photographs: sizes and orientations of the pictures that structure from motion reads, by view.
+        bracketed: True if several exposures of a shot were merged. All views are then stored as floating-point numbers.
     """
 
     notes: list[str] = []
+    bracketed: bool = False
     photographs: dict[str, Geometry] | UnsetType = UNSET
 
 
@@ -86,6 +89,7 @@ class ViewRecord(msgspec.Struct, kw_only=True):
     dark_share: float | UnsetType = UNSET
     negative_share: float | UnsetType = UNSET
     invalid_share: float | UnsetType = UNSET
+    stops: list[float] | UnsetType = UNSET
     geometry: Geometry
     warp: WarpRecord | None = None
     files: dict[str, int] = {}
@@ -94,6 +98,11 @@ class ViewRecord(msgspec.Struct, kw_only=True):
     def turned(self) -> bool:
         """True if the view was rotated for display."""
         return self.orientation not in (UNSET, 1)
+
+
+def stops_record(exposures: MergedExposures) -> list[float] | UnsetType:
+    """Return the merged exposures of a view in stops. Return ``UNSET`` for one exposure."""
+    return [round(stop, 4) for stop in exposures.stops] if len(exposures.stops) > 1 else UNSET
 
 
 class FileStamp(msgspec.Struct, frozen=True, array_like=True):

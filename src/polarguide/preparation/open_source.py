@@ -6,6 +6,7 @@ Poses refer to the pictures as stored, or to the pictures after rotation by EXIF
 from __future__ import annotations
 
 import shlex
+import warnings
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -14,6 +15,7 @@ from pathlib import Path
 from polarguide.capture.colmap.model import holds_model, view_of_name
 from polarguide.capture.colmap.poses import Poses
 from polarguide.capture.datasets.readers import PISR_SENSOR, detect_dataset, open_dataset
+from polarguide.capture.exposure_files import index_shot_files, list_shot_files, shot_stem
 from polarguide.capture.exposures import TABLE, angles_of_names, folders_of_angles, parse_angle
 from polarguide.capture.filter.camera_files import QUARTER_TURNS, TURNS
 from polarguide.capture.filter.consecutive import (
@@ -24,13 +26,13 @@ from polarguide.capture.filter.consecutive import (
 )
 from polarguide.capture.filter.shots import SHOT_SUFFIXES, find_shots
 from polarguide.capture.formats.pictures import SUFFIXES, decode_picture, read_picture
-from polarguide.capture.layout import angle_folders, describe_contents, index_files, list_files
+from polarguide.capture.layout import angle_folders, describe_contents
 from polarguide.capture.pose_files import SUFFIXES as POSE_FILES
 from polarguide.capture.pose_files import TEST, parts_of_poses, read_parts
 from polarguide.capture.sensor.pattern import SENSOR_NAMES
 from polarguide.capture.sensor.raw_file import RAW_SUFFIXES
 from polarguide.capture.view import ANGLES, listed
-from polarguide.core.errors import PolarguideError
+from polarguide.core.errors import PolarguideError, PolarguideWarning
 from polarguide.core.files import require_folder
 from polarguide.core.progress import Reporter
 from polarguide.core.text import command, stem_of
@@ -143,7 +145,7 @@ def _consecutive(
     if angles is None or angles == "none" or angles.lower().endswith(".csv"):
         return settings, None, ()
     stated = [parse_angle(part) for part in angles.split(",")]
-    files = list(index_files(root, SHOT_SUFFIXES).values())
+    files = list(index_shot_files(root, SHOT_SUFFIXES).values())
     notes: tuple[str, ...] = ()
     each = settings.shots_per_view
     if each is None and (each := shots_of_one_place(files)) is not None:
@@ -172,7 +174,7 @@ def _consecutive(
     shots: Shots = {}
     for number, path in enumerate(files):
         place = number % len(ANGLES)
-        shots.setdefault(files[number - place].stem, {})[round(four[place])] = path
+        shots.setdefault(shot_stem(files[number - place]), {})[round(four[place])] = path
     return settings, shots, notes
 
 
@@ -183,8 +185,8 @@ def _require_photographs(root: Path) -> None:
         PolarguideError: the folder contains raw mosaics, gray pictures or no picture; names of pictures contain numbers
             that may be angles; or consecutive pictures show one place, as shots through a filter do.
     """
-    files = list(index_files(root, SHOT_SUFFIXES).values())
-    if not files or index_files(root, tuple(set(RAW_SUFFIXES) - set(SHOT_SUFFIXES))):
+    files = list(index_shot_files(root, SHOT_SUFFIXES).values())
+    if not files or index_shot_files(root, tuple(set(RAW_SUFFIXES) - set(SHOT_SUFFIXES))):
         raise _unknown_layout(root)
     for path in (files[0], files[-1]):
         if path.suffix.lower() in RAW_SUFFIXES and _is_gray(path):  # like raw mosaics
@@ -220,6 +222,27 @@ def _is_gray(path: Path) -> bool:
     return bool((pixels[..., 0] == pixels[..., 1]).all())
 
 
+def describe_source(root: Path, settings: PrepareSettings) -> str:
+    """Return a description of the capture in a folder, as ``prepare_scene`` recognizes it. Nothing is written.
+
+    Raises:
+        PolarguideError: the folder does not exist, or contains no readable picture.
+    """
+    if _is_video(root):
+        return f"the video {listed([video.name for video in find_videos(root)])}"
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", PolarguideWarning)  # the preparation repeats them
+        return open_source(root, settings.checked()).description
+
+
+def _is_video(root: Path) -> bool:
+    """Return True if a path is a video, or a folder of videos without pictures and folders."""
+    pictures = SHOT_SUFFIXES + RAW_SUFFIXES
+    return bool(find_videos(root)) and not (
+        root.is_dir() and any(path.is_dir() or path.suffix.lower() in pictures for path in root.iterdir())
+    )
+
+
 def frames_of_video(
     root: Path, out: Path, settings: PrepareSettings, reporter: Reporter
 ) -> tuple[Path, PrepareSettings]:
@@ -235,8 +258,7 @@ def frames_of_video(
     if not videos:
         return root, settings
     names = listed([video.name for video in videos])
-    if root.is_dir() and any(path.is_dir() or path.suffix.lower() in SHOT_SUFFIXES + RAW_SUFFIXES
-                             for path in root.iterdir()):  # fmt: skip
+    if not _is_video(root):
         reporter.say(
             f"Not used: {names}. To prepare frames of a video, use polarguide prepare VIDEO --out SCENE."
         )
@@ -266,10 +288,10 @@ def are_single_shots(root: Path, settings: PrepareSettings) -> bool:
         return False
     if settings.angles is not None or (root / TABLE).exists():
         return True
-    files = list_files(root, SHOT_SUFFIXES)
+    files = list_shot_files(root, SHOT_SUFFIXES)
     if not files:
         return any(angle not in ANGLES for angle in folders_of_angles(root).values())
-    shots = [name for name in angles_of_names([stem_of(path) for path in files]) if name is not None]
+    shots = [name for name in angles_of_names([shot_stem(path) for path in files]) if name is not None]
     if any(angle not in ANGLES for _, angle in shots):
         return True
     return len({view for view, _ in shots}) == len(files)
@@ -277,7 +299,7 @@ def are_single_shots(root: Path, settings: PrepareSettings) -> bool:
 
 def _unknown_layout(root: Path) -> PolarguideError:
     """Return the error for a folder whose format is not recognized. It lists the files and possible commands."""
-    mosaics = index_files(root, RAW_SUFFIXES)
+    mosaics = index_shot_files(root, RAW_SUFFIXES)
     folders = sorted(path.name for path in root.iterdir() if path.is_dir() and not path.name.startswith("."))
     names = listed(sorted(path.name for path in mosaics.values()))
     contents = [f"{len(mosaics)} pictures without angles in their names ({names})"] if mosaics else []

@@ -20,6 +20,7 @@ from typing import Any
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
 from polarguide import __version__
 from polarguide.capture.colmap.model import read_model
@@ -35,6 +36,8 @@ from polarguide.capture.write import (
     intensity_codes,
     picture_name,
     picture_names,
+    rounded_radiance,
+    suffix_of,
     write_png_file,
     write_view,
 )
@@ -254,7 +257,7 @@ def _require_own_files(journal: Path, view: str, files: Iterable[str]) -> None:
     Raises:
         PolarguideError: the journal lists a file of another view or folder.
     """
-    pictures = re.compile(rf"polar/{re.escape(view)}_{_LABEL}\.png")
+    pictures = re.compile(rf"polar/{re.escape(view)}_{_LABEL}\.(png|tif)")
     own = {f"invalid/{view}.png", f"masks/{view}.png"}
     others = sorted(name for name in set(files) - own if not pictures.fullmatch(name))
     if others or set(view) & set("/\\\0"):
@@ -272,7 +275,8 @@ def _require_exposures(journal: Path, view: str, record: ViewRecord) -> None:
     Raises:
         PolarguideError: exposures are missing.
     """
-    named = picture_names(view, [exposure.angle for exposure in record.exposures or ()])
+    angles = [exposure.angle for exposure in record.exposures or ()]
+    named = picture_names(view, angles, suffix_of(record.files))
     pictures = sorted(name for name in record.files if name.startswith("polar/"))
     if sorted(named) != pictures or not named:
         raise PolarguideError(
@@ -455,7 +459,7 @@ def prepare_scene(
     if folder.finished:
         reporter.say(f"{target} is already complete.")
         return _outcome(folder, pictures, settings, new=False)
-    reporter.say(f"{len(pictures.views)} views, format {pictures.kind}.")
+    reporter.say(f"{pictures.description}.")
     if poses is not None:
         for note in filter(None, (frames, *poses.notes)):
             reporter.say(note)
@@ -601,7 +605,11 @@ def _write_view(
         intensities, invalid = warp.apply(intensities, invalid)
         mask = None if mask is None else warp.apply_mask(mask)
         record.warp = _warp_record(warp)
-    codes = intensity_codes(intensities, invalid, getattr(folder.measured, "rounding", EXACT))
+    rounding = getattr(folder.measured, "rounding", EXACT)
+    if not folder.measured.bracketed:
+        codes: NDArray[Any] = intensity_codes(intensities, invalid, rounding)
+    else:
+        codes = intensities if rounding == EXACT else rounded_radiance(intensities)
     record.files = write_view(folder.root, view, codes, invalid, mask, done.angles)
     folder.views[view] = record
     folder.save()

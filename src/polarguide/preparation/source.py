@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polarguide.capture.angle_evidence import OutlineAgreement, outline_agreement, sense_of_outlines
+from polarguide.capture.brackets import Bracket, Radiance, bracket_notes
 from polarguide.capture.calibration import UNIDENTIFIED, Sense, oriented
 from polarguide.capture.colmap.model import PosedCamera
 from polarguide.capture.colmap.poses import Geometry
@@ -27,10 +28,11 @@ from polarguide.capture.develop import (
     pair_gains,
     sample_blocks,
 )
+from polarguide.capture.exposure_files import all_exposures, index_shot_files
 from polarguide.capture.exposures import Angle
 from polarguide.capture.filter.camera_files import INVERSE, QUARTER_TURNS, Lens, apply_orientation
 from polarguide.capture.formats.pictures import stated_size
-from polarguide.capture.layout import index_files, require_memory_of_each
+from polarguide.capture.layout import require_memory_of_each
 from polarguide.capture.raw_options import CameraOptions
 from polarguide.capture.sensor.demosaic import DEMOSAIC_MODES, defects, defects_note, demosaic
 from polarguide.capture.sensor.pattern import (
@@ -39,7 +41,6 @@ from polarguide.capture.sensor.pattern import (
     Levels,
     agreed_full_scale,
     require_kind,
-    unusable_samples,
 )
 from polarguide.capture.sensor.raw_file import RAW_SUFFIXES
 from polarguide.capture.view import FULL_CODE
@@ -47,7 +48,7 @@ from polarguide.capture.write import EXACT, rounding_of
 from polarguide.core.errors import PolarguideError, PolarguideWarning
 from polarguide.core.progress import Advance
 from polarguide.geometry.polarizer import ANGLES, four_intensities
-from polarguide.preparation.journal import Factor, Measured, StoredRounding, ViewRecord
+from polarguide.preparation.journal import Factor, Measured, StoredRounding, ViewRecord, stops_record
 from polarguide.preparation.settings import MosaicSettings, white_gains
 
 
@@ -56,8 +57,8 @@ class DevelopedView:
     """Developed pictures of one view.
 
     Attributes:
-        intensities: [4, H, W, 3] float32 in [0, 1], linear, at 0, 45, 90 and 135 degrees. For other angles [K, H, W,
-            3].
+        intensities: [4, H, W, 3] float32, linear, at 0, 45, 90 and 135 degrees. For other angles [K, H, W, 3]. Values
+            are in [0, 1], and may be larger if the capture has brackets.
         invalid: mask [H, W] of pixels that depend on an unusable sample.
         mask: object mask [H, W], or None.
         angles: angles of the pictures, counter-clockwise as displayed.
@@ -114,6 +115,11 @@ class Source(Protocol):
     views: list[str]
     paths: list[Path]
     masks: Mapping[str, Path] = MappingProxyType({})
+
+    @property
+    def description(self) -> str:
+        """Number of views and their kind, for the user."""
+        return f"{len(self.views)} views of the dataset {self.kind}"
 
     def measure(self, advance: Advance) -> Measured:
         """Measure the properties that all views of the capture share."""
@@ -421,14 +427,15 @@ class MosaicSource(Source):
         self._dataset = dataset
         self._mosaics = MosaicFiles(settings)
         self._settings = settings
-        files = index_files(root, RAW_SUFFIXES)
+        files = index_shot_files(root, RAW_SUFFIXES)
         if settings.dark_frame is not None:
             dark = os.path.realpath(settings.dark_frame)
             files = {view: path for view, path in files.items() if os.path.realpath(path) != dark}
         names = files.keys() if dataset is None else dataset.views
         self._files = {view: files[view] for view in sorted(names)}
         self.views = list(self._files)
-        self.paths = list(self._files.values() if dataset is None else dataset.paths)
+        self._brackets = {view: Bracket.of([path]) for view, path in self._files.items()}
+        self.paths = all_exposures(list(self._files.values())) if dataset is None else list(dataset.paths)
         self.paths += [path for path in (settings.dark_frame, settings.analyzers) if path is not None]
         self._white = white_gains(settings.white_balance)
         self._defective: NDArray[np.bool_] | None = None
@@ -439,6 +446,12 @@ class MosaicSource(Source):
                 found=settings.white_balance,
                 remedy="Remove the option.",
             )
+
+    @property
+    def description(self) -> str:
+        """Number of mosaics."""
+        mosaics = f"{len(self.views)} raw mosaics of a polarization camera"
+        return mosaics if self._dataset is None else f"{super().description}, {mosaics}"
 
     def stored(self, view: str) -> Stored:
         """Return the size of a view, from the header of its mosaic or from the settings."""
@@ -464,22 +477,24 @@ class MosaicSource(Source):
         stated: dict[Path, int | None] = {}
         samples: list[NDArray[Any]] = []
         blocks: list[NDArray[Any]] = []
-        for count, path in enumerate(self._files.values(), 1):
-            values = self._mosaics.read(path)
-            shape = shape or (values.shape, values.dtype)
-            if (values.shape, values.dtype) != shape:
-                (height, width), kind = shape
-                raise PolarguideError(
-                    path,
-                    expected=f"{width}x{height} pixels of {kind}, as in the first file",
-                    found=f"{values.shape[1]}x{values.shape[0]} pixels of {values.dtype}",
-                    remedy="Prepare captures that differ in size or bit depth separately, each with its own --out.",
-                )
-            container, stated[path] = self._mosaics.depth(path, values)
-            counts += np.bincount(values.ravel(), minlength=len(counts))
-            cut = self._mosaics.cut(values)
-            samples.append(sample_blocks(cut, 2 * self._mosaics.pattern.period))
-            blocks.append(sample_blocks(cut, SIDE))
+        for count, (view, first) in enumerate(self._files.items(), 1):
+            for (path,) in self._brackets[view].files:
+                values = self._mosaics.read(path)
+                shape = shape or (values.shape, values.dtype)
+                if (values.shape, values.dtype) != shape:
+                    (height, width), kind = shape
+                    raise PolarguideError(
+                        path,
+                        expected=f"{width}x{height} pixels of {kind}, as in the first file",
+                        found=f"{values.shape[1]}x{values.shape[0]} pixels of {values.dtype}",
+                        remedy="Prepare captures that differ in size or bit depth separately, each with its own --out.",
+                    )
+                container, stated[path] = self._mosaics.depth(path, values)
+                counts += np.bincount(values.ravel(), minlength=len(counts))
+                if path == first:
+                    cut = self._mosaics.cut(values)
+                    samples.append(sample_blocks(cut, 2 * self._mosaics.pattern.period))
+                    blocks.append(sample_blocks(cut, SIDE))
             advance(count)
         assert shape is not None
         settings = self._settings
@@ -515,7 +530,10 @@ class MosaicSource(Source):
             # The smallest factor of a sample.
             factor = min(white) / max(gains) / max(1.0, peak)
             rounding = rounding_of(np.array([0.0, FULL_CODE * factor / ((1 << levels.bits) - 1)]))
+        several = [view for view, bracket in self._brackets.items() if not bracket.single]
+        merged = [self._merged(view, levels)[0].exposures for view in several]
         return MosaicMeasured(
+            bracketed=bool(several),
             levels=levels,
             pattern=tuple(self._mosaics.pattern.rows()),
             crop=self._mosaics.crop,
@@ -526,8 +544,24 @@ class MosaicSource(Source):
             scale=1.0 / max(1.0, peak),
             rounding=tuple(rounding),
             defects=defective,
-            notes=notes,
+            notes=[*notes, *bracket_notes(merged)],
         )
+
+    def _merged(self, view: str, levels: Levels) -> tuple[Radiance, NDArray[np.bool_], tuple[int, ...]]:
+        """Read the exposures of a view and merge them.
+
+        Returns:
+            The merged samples; the mask of dark samples; and the numbers of rows and columns of the stored mosaic.
+
+        Raises:
+            PolarguideError: the exposures contradict each other.
+        """
+        bracket = self._brackets[view]
+        stored = [self._mosaics.read(path) for (path,) in bracket.files]
+        values = [self._mosaics.cut(each) for each in stored]
+        shape = stored[0].shape
+        radiance, black = self._mosaics.merged(bracket, values, levels, self._mosaics.dark(shape))
+        return radiance, black, shape
 
     def _defects(self, levels: Levels) -> NDArray[np.bool_]:
         """Return a mask of defective samples.
@@ -549,21 +583,20 @@ class MosaicSource(Source):
         The steps are: find invalid samples, correct levels and gains, demosaic, and correct the direction of the
         angles.
         """
-        stored = self._mosaics.read(self._files[view])
-        dark = self._mosaics.dark(stored.shape)
-        values = self._mosaics.cut(stored)
         levels = measured.levels
-        saturated, black = unusable_samples(values, levels, dark)
-        linear, (bad,) = self._mosaics.linear(values, levels, dark, saturated | black | self._defects(levels))
+        radiance, black, shape = self._merged(view, levels)
+        saturated = radiance.clipped
+        linear, (bad,) = self._mosaics.calibrated(radiance.values, saturated | black | self._defects(levels))
         linear = linear * self._mosaics.sample_factors(
-            values.shape, measured.gains, measured.white_balance, measured.scale
+            linear.shape, measured.gains, measured.white_balance, measured.scale
         )
         settings = self._settings
         picture = demosaic(
             linear, bad, self._mosaics.pattern,
             mode=settings.demosaic, interpolation=settings.interpolation, registered=settings.register,
         )  # fmt: skip
-        intensities = oriented(np.clip(picture.intensities, 0.0, 1.0), settings.calibration)
+        largest = None if measured.bracketed else 1.0
+        intensities = oriented(np.clip(picture.intensities, 0.0, largest), settings.calibration)
         height, width = picture.invalid.shape
         return DevelopedView(
             intensities=intensities,
@@ -572,8 +605,9 @@ class MosaicSource(Source):
                 clipped_share=round(float(saturated.mean()), 6),
                 dark_share=round(float(black.mean()), 6),
                 invalid_share=round(float(picture.invalid.mean()), 6),
+                stops=stops_record(radiance.exposures),
                 geometry=Geometry(
-                    (stored.shape[1], stored.shape[0]),
+                    (shape[1], shape[0]),
                     self._mosaics.crop,
                     DEMOSAIC_MODES[settings.demosaic],
                     (width, height),

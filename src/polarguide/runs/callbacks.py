@@ -93,11 +93,11 @@ class Progress(Callback[Loop]):
 
     Args:
         advance: function that receives progress.
-        log: log of the run. None if this rank writes no log.
+        log: log of the run.
         stopwatch: stopwatch of the training.
     """
 
-    def __init__(self, advance: Advance, log: RunLog | None, stopwatch: Stopwatch) -> None:
+    def __init__(self, advance: Advance, log: RunLog, stopwatch: Stopwatch) -> None:
         self._advance = advance
         self._log = log
         self._stopwatch = stopwatch
@@ -109,14 +109,12 @@ class Progress(Callback[Loop]):
     def after_step(self, loop: Loop, report: StepReport) -> None:
         if self._first < 0:
             self._first = report.done - 1
-        elif report.step == 0 and self._log is not None:
+        elif report.step == 0:
             self._log.cut(0)  # the training has begun again
         self._waiting.append(report)
         if (report.step + 1) % LOG_EVERY:
             return
         loss, psnr = self.read()
-        if self._log is None:
-            return
         seconds, alone = self._stopwatch.read()
         self._log.append(
             step=report.step,
@@ -183,11 +181,9 @@ class Checkpoints(Callback[Loop]):
         self.save(loop)
 
     def save(self, loop: Loop) -> None:
-        """Save the state with the sums of all ranks. Every rank has to call it."""
-        state = loop.saved_state()
-        if loop.ranks.rank == 0:
-            unfinished = state.step < loop.settings.steps
-            save_checkpoint(self.out, state, optimizer=unfinished or self.session.keep_optimizer)
+        """Save the state."""
+        unfinished = loop.state.step < loop.settings.steps
+        save_checkpoint(self.out, loop.state, optimizer=unfinished or self.session.keep_optimizer)
 
 
 @dataclass(eq=False)
@@ -215,7 +211,7 @@ class MemoryLimit(Callback[Loop]):
 
 @dataclass(eq=False)
 class Stop(Callback[Loop]):
-    """Callback that ends the training on request, after the same step on all ranks."""
+    """Callback that ends the training on request."""
 
     should_stop: Ends
 
@@ -225,9 +221,7 @@ class Stop(Callback[Loop]):
     def check(self, loop: Loop) -> None:
         """Raise TrainingStopped if the training should end before its last step."""
         step = loop.state.step
-        # Ranks rarely exchange the request, because each exchange takes time.
-        due = step < loop.settings.steps and (loop.ranks.world == 1 or step % LOG_EVERY == 0)
-        if due and loop.ranks.any(self.should_stop()):
+        if step < loop.settings.steps and self.should_stop():
             raise TrainingStopped(step)
 
 
@@ -261,7 +255,7 @@ def run_to_the_end(
     look: Look | None,
     planned: int,
 ) -> None:
-    """Train to the end with progress, checkpoints and a log. Only rank 0 writes files.
+    """Train to the end with progress, checkpoints and a log.
 
     Args:
         loop: the loop. The callbacks of this module are inserted before its existing observers.
@@ -275,10 +269,9 @@ def run_to_the_end(
     Raises:
         TrainingStopped: ``should_stop`` returned True; the state is saved.
     """
-    log = RunLog(out) if loop.ranks.rank == 0 else None
-    if log is not None:
-        log.cut(loop.state.step)
-    stopwatch = Stopwatch(*(log.elapsed() if log else (0.0, True)))
+    log = RunLog(out)
+    log.cut(loop.state.step)
+    stopwatch = Stopwatch(*log.elapsed())
     stop = Stop(should_stop)
     with reporter.track("training", loop.total) as advance:
         progress = Progress(advance, log, stopwatch)
@@ -296,7 +289,7 @@ def run_to_the_end(
             checkpoints.save(loop)
             raise
         except KeyboardInterrupt:
-            if loop.ranks.world == 1 and loop.whole:
+            if loop.whole:
                 checkpoints.save(loop)
             raise
     for observer in loop.observers:

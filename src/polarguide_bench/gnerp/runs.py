@@ -29,11 +29,11 @@ from polarguide.runs.folder import CHECKPOINT, RunConfiguration, checkpoint_tens
 from polarguide.runs.memory_plan import PROCESS, MemoryPlan, pixels_of, share_memory
 from polarguide.runs.opened import read_scene, trained_scene
 from polarguide.runs.train import (
+    check_run_folder,
     check_same_run,
     check_step,
     check_trainable,
     ignored_filters,
-    unsuitable_folder,
     view_store,
 )
 from polarguide.training.settings import ResolvedSettings, TrainSettings
@@ -149,8 +149,7 @@ def train_field(
     """
     out = Path(out)
     use_threads(session.threads)
-    if problem := unsuitable_folder(out, resume):
-        raise problem
+    check_run_folder(out, resume)
     backend = choose_backend(session.device, say=reporter.say)
     plan = plan_field_memory(pixels_of(Path(scene), reading.downscale), recipe, limit=reading.memory)
     earlier = RunConfiguration.load(out) if resume else None

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from polarguide.capture.exposure_files import index_shot_files, list_shot_files, shot_stem
 from polarguide.capture.exposures import (
     NAMING,
     TABLE,
@@ -30,8 +31,6 @@ from polarguide.capture.formats.pictures import SUFFIXES, decode_picture, is_los
 from polarguide.capture.layout import (
     ambiguous,
     angle_folders,
-    index_files,
-    list_files,
     require_angle_folders,
 )
 from polarguide.capture.sensor.pattern import Levels
@@ -39,7 +38,7 @@ from polarguide.capture.sensor.raw_file import RAW_SUFFIXES
 from polarguide.capture.view import ANGLES
 from polarguide.capture.view_reader import require_alike
 from polarguide.core.errors import PolarguideError
-from polarguide.core.text import canonical, listed, stem_of
+from polarguide.core.text import canonical, listed
 
 SHOT_SUFFIXES = (*SUFFIXES, *CAMERA_RAW)
 Candidates = dict[str, dict[int, list[Path]]]
@@ -109,16 +108,16 @@ def list_shots(root: Path, *, nested: bool = False) -> tuple[Candidates, list[Pa
     """
     folders = angle_folders(root)
     if not folders:
-        files = list_files(root, SHOT_SUFFIXES)
-        if nested and not files and not index_files(root, RAW_SUFFIXES):
+        files = list_shot_files(root, SHOT_SUFFIXES)
+        if nested and not files and not index_shot_files(root, RAW_SUFFIXES):
             below = sorted(path for path in root.iterdir() if path.is_dir() and not path.name.startswith("."))
-            files = [file for folder in below for file in list_files(folder, SHOT_SUFFIXES)]
+            files = [file for folder in below for file in list_shot_files(folder, SHOT_SUFFIXES)]
         return group_files(files)
     require_angle_folders(root, folders)
     shots: Candidates = {}
     for angle, folder in folders.items():
-        for path in list_files(folder, SHOT_SUFFIXES):
-            shots.setdefault(stem_of(path), {}).setdefault(angle, []).append(path)
+        for path in list_shot_files(folder, SHOT_SUFFIXES):
+            shots.setdefault(shot_stem(path), {}).setdefault(angle, []).append(path)
     if not shots:
         _refuse_other_formats(folders.values())
     return shots, []
@@ -156,9 +155,9 @@ def group_files(files: Sequence[Path]) -> tuple[Candidates, list[Path]]:
     others: list[Path] = []
     for folder in dict.fromkeys(path.parent for path in files):
         inside = [path for path in files if path.parent == folder]
-        alone = all(_BARE.fullmatch(stem_of(path)) for path in inside)
+        alone = all(_BARE.fullmatch(shot_stem(path)) for path in inside)
         for path in inside:
-            match = (_BARE if alone else _SUFFIX).fullmatch(stem_of(path))
+            match = (_BARE if alone else _SUFFIX).fullmatch(shot_stem(path))
             if match is None:
                 others.append(path)
                 continue
@@ -312,11 +311,11 @@ def find_single_shots(
     if angles is not None or table.exists():
         table = Path(angles) if angles is not None else table
         return _validated(root, _by_table(root, table)), [table]
-    files = list_files(root, SHOT_SUFFIXES)
+    files = list_shot_files(root, SHOT_SUFFIXES)
     shots = [
         SingleShot(path, stem, angle)
         for folder, angle in ({} if files else folders_of_angles(root)).items()
-        for stem, path in index_files(folder, SHOT_SUFFIXES).items()
+        for stem, path in index_shot_files(folder, SHOT_SUFFIXES).items()
     ]
     if shots:
         return _validated(root, shots), []
@@ -338,7 +337,7 @@ def views_of_names(folder: Path, files: Sequence[Path]) -> list[tuple[str, Angle
     The result is ``None`` for a name without an angle. If all files are named by an angle only, they are one view with
     the name of the folder.
     """
-    names = angles_of_names([stem_of(path) for path in files])
+    names = angles_of_names([shot_stem(path) for path in files])
     alone = all(name is not None and not name[0] for name in names)
     own = canonical(folder.resolve().name) if alone else ""
     return [(name[0] or own, name[1]) if name is not None and (name[0] or alone) else None for name in names]
@@ -360,7 +359,7 @@ def _with_angles(root: Path, angles: str, each: int) -> list[SingleShot]:
             found=repr(angles),
             remedy="Use one of these four.",
         )
-    files = list(index_files(root, SHOT_SUFFIXES).values())
+    files = list(index_shot_files(root, SHOT_SUFFIXES).values())
     period = max(each, len(repeating))
     if len(files) % period or len(repeating) not in (1, period):
         raise PolarguideError(
@@ -371,7 +370,7 @@ def _with_angles(root: Path, angles: str, each: int) -> list[SingleShot]:
         )
     repeated = [repeating[number % len(repeating)] for number in range(len(files))]
     return [
-        SingleShot(path, stem_of(files[number - number % each]), angle)
+        SingleShot(path, shot_stem(files[number - number % each]), angle)
         for number, (path, angle) in enumerate(zip(files, repeated, strict=True))
         if angle is not None
     ]
@@ -398,7 +397,7 @@ def listed_pictures(root: Path, table: Path) -> tuple[list[tuple[Line, Path]], l
                 remedy="Copy or convert the file, or remove the line.",
             )
     in_table = {path.resolve() for _, path in rows}
-    return rows, [path for path in list_files(root, SHOT_SUFFIXES) if path.resolve() not in in_table]
+    return rows, [path for path in list_shot_files(root, SHOT_SUFFIXES) if path.resolve() not in in_table]
 
 
 def _by_table(root: Path, table: Path) -> list[SingleShot]:
@@ -418,7 +417,7 @@ def _by_table(root: Path, table: Path) -> list[SingleShot]:
                 found="nothing with this name",
                 remedy="Correct the name, or remove the line.",
             )
-        stem = stem_of(path)
+        stem = shot_stem(path)
         if line.view is None and alone.setdefault(stem, path) is not path:
             raise ambiguous(root, f"one photograph called {stem}", alone[stem], path)
         shots.append(SingleShot(path, line.view or stem, line.angle, line.gain))

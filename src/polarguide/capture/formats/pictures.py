@@ -320,7 +320,7 @@ MATERIAL_REMEDY = (
 )
 
 
-def decode_picture(path: Path, data: bytes) -> NDArray[Any]:
+def decode_picture(path: Path, data: bytes, *, keep_floats: bool = False) -> NDArray[Any]:
     """Decode a photograph.
 
     Args:
@@ -329,9 +329,11 @@ def decode_picture(path: Path, data: bytes) -> NDArray[Any]:
             Files with fewer bits, see ``stated_full_scale``, are rescaled to 8 or 16. A TIFF file of floating-point
             numbers from 0 to 1 is converted to 16 bits, and larger numbers become full scale. An opaque alpha channel
             is removed. An orientation tag is ignored, because poses refer to the stored pixels.
+        keep_floats: return floating-point numbers without conversion, also numbers above 1.
 
     Returns:
-        Stored pixels [H, W, 3] uint8 or uint16, RGB. A gray picture has three equal channels.
+        Stored pixels [H, W, 3] uint8 or uint16, RGB, or float32 if ``keep_floats``. A gray picture has three equal
+        channels.
 
     Raises:
         PolarguideError: the file is damaged, truncated, of an unsupported kind, or has transparent pixels.
@@ -339,11 +341,12 @@ def decode_picture(path: Path, data: bytes) -> NDArray[Any]:
     pixels = decode_stored(path, data)
     full = stated_full_scale(path, io.BytesIO(data), pixels)
     if pixels.dtype.kind == "f":
-        pixels = _codes_of_floats(path, pixels)
+        _require_unit_floats(path, pixels)
+        pixels = np.maximum(pixels, 0).astype(np.float32) if keep_floats else codes_of_floats(pixels)
     elif full is not None:
         pixels = rescaled(pixels, full)
     require(
-        pixels.dtype in (np.uint8, np.uint16),
+        pixels.dtype in (np.uint8, np.uint16, np.float32),
         path,
         expected="a picture with 8 or 16 bits a channel",
         found=f"values of type {pixels.dtype}",
@@ -362,7 +365,7 @@ def decode_picture(path: Path, data: bytes) -> NDArray[Any]:
     return np.ascontiguousarray(pixels[..., 2::-1])
 
 
-def _codes_of_floats(path: Path, pixels: NDArray[Any]) -> NDArray[np.uint16]:
+def _require_unit_floats(path: Path, pixels: NDArray[Any]) -> None:
     require(
         np.isfinite(pixels).all() and float(np.median(pixels)) <= 1.0,
         path,
@@ -372,6 +375,10 @@ def _codes_of_floats(path: Path, pixels: NDArray[Any]) -> NDArray[np.uint16]:
         else f"up to {float(pixels.max()):g}",
         remedy="Divide by the value at which the camera saturates, or save 16-bit whole numbers.",
     )
+
+
+def codes_of_floats(pixels: NDArray[Any]) -> NDArray[np.uint16]:
+    """Convert linear intensities to 16-bit codes. Values outside [0, 1] are clipped."""
     # Half precision ends at 65504, below the largest code, so double precision is used.
     return np.rint(np.clip(pixels.astype(np.float64), 0.0, 1.0) * FULL_CODE).astype(np.uint16)
 
@@ -473,8 +480,13 @@ def decode_materials(path: Path, data: bytes) -> NDArray[np.uint8]:
     return np.asarray(gray, np.uint8)
 
 
-def linear_codes(pixels: NDArray[Any], transfer: str) -> NDArray[np.uint16]:
-    """Convert stored 8- or 16-bit values to the codes ``round(65535 * linear intensity)``, uint16."""
+def linear_codes(pixels: NDArray[Any], transfer: str) -> NDArray[Any]:
+    """Convert stored 8- or 16-bit values to the codes ``round(65535 * linear intensity)``, uint16.
+
+    Floating-point numbers are linear intensities. Their codes are floating-point numbers in the same unit.
+    """
+    if pixels.dtype.kind == "f":
+        return pixels * np.float32(FULL_CODE)
     if pixels.dtype == np.uint16 and transfer == "linear":
         return pixels.astype(np.uint16, copy=False)
     return _table(int(np.iinfo(pixels.dtype).max), transfer)[pixels]

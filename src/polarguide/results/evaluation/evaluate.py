@@ -34,6 +34,7 @@ from polarguide.results.evaluation.mesh import mesh_scores
 from polarguide.results.evaluation.metrics import HAZE_DEPTH, Selection, normal_angles_deg
 from polarguide.results.evaluation.record import METRICS_FILE, code_digest, commit, write_metrics
 from polarguide.results.evaluation.scores import ErrorsByObject, ViewScores, score_view
+from polarguide.results.evaluation.table import registered_digests
 from polarguide.results.evaluation.target import SceneFacts, ViewTarget
 from polarguide.results.rendering.mesh import RESOLUTION, Surface, fused_surface
 from polarguide.runs.callbacks import Stopwatch
@@ -489,6 +490,7 @@ def _provenance(run: ScoredRun) -> dict[str, Any]:
         "seed": configuration.settings.seed,
         "commit": commit(),
         "sources": code_digest(),
+        "metrics": registered_digests(),
         "versions": {
             "polarguide": polarguide.__version__,
             "torch": torch.__version__,

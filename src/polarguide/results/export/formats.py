@@ -36,13 +36,12 @@ from polarguide.core.options import (
     check_finite,
 )
 from polarguide.core.progress import SILENT, Reporter
-from polarguide.optics.color import srgb_encode
 from polarguide.results.evaluation.record import METRICS_FILE, read_metrics
 from polarguide.results.evaluation.table import shown_metrics
 from polarguide.results.export.adapters import ply_fields
-from polarguide.results.export.mesh import asset_record, surface_points, write_mesh, write_points
+from polarguide.results.export.mesh import asset_record, write_mesh
 from polarguide.results.export.model.build import BASE_COLORS, Charted, charted_subject, textured_model
-from polarguide.results.export.model.gltf import write_glb, write_obj
+from polarguide.results.export.model.gltf import write_glb
 from polarguide.results.export.model.topology import subject_surface, write_stl
 from polarguide.results.export.placement import (
     GENERATOR,
@@ -51,7 +50,6 @@ from polarguide.results.export.placement import (
     Origin,
     Placement,
     Presented,
-    comments,
     rewrite_splats,
     transforms,
     write_colmap,
@@ -193,9 +191,8 @@ def export(
         run: the run. The formats ply, spz and sog read only poses and masks of its scene.
         format: format of the file. Splats (ply, spz, sog, splat-glb, splat-usdz) have reflections baked into harmonics.
             The mesh (GLB and PLY) is fused from rendered depth and has diffuse colors and learned normals. The textured
-            model is glb, obj or usdz, and its closed surface stl. The points are opaque Gaussians with normals. The
-            environment is the learned light as a panorama (EXR, HDR and PNG). The cameras are a COLMAP model and
-            transforms.json.
+            model is glb or usdz, and its closed surface stl. The environment is the learned light as a panorama (EXR,
+            HDR and PNG). The cameras are a COLMAP model and transforms.json.
         out: folder to write; default: ``export`` in the run's folder.
         resolution: number of voxels of the mesh along its longest side, 16 to 1024.
         spz_version: version of the SPZ file, 3 or 4. Most programs can read only one of the versions.
@@ -351,10 +348,6 @@ class _Exporter:
             self.run, subject, presented.presentation, placement, options, self.reporter
         )
         meaning = BASE_COLORS[options.resolved_base_color]
-        if kind == "obj":
-            upright = replace(placement, upright=False)  # The file is always +y up.
-            lines = [*comments(presented.origin, upright), "up_axis +y", f"base_color {meaning}"]
-            return write_obj(self.folder, textured, lines, jpeg=options.jpeg)
         asset = asset_record(placement, presented.origin)
         asset["extras"]["base_color"] = meaning
         path = self.folder / f"model{'-unlit' if options.unlit else ''}.{kind}"
@@ -416,19 +409,6 @@ class _Exporter:
             write_text(parts / RECORD, json.dumps({**record, "files": about_files(names)}, indent=1) + "\n")
         return [self.folder / name for name in [RECORD, *names]]
 
-    def points(self) -> list[Path]:
-        path = self.folder / "points.ply"
-        model = self.run.model
-        presented = self.presented
-        placement = presented.placement
-        means, normals, linear = surface_points(
-            presented.gaussians, model.shading, self.run.scene.views, model.backend.rasterize
-        )
-        colors = srgb_encode(colored(linear, presented.presentation.color).clamp(0, 1))
-        points = placement.points(means)
-        write_points(path, points, placement.directions(normals), colors, presented.comments)
-        return [path]
-
     def environment(self) -> list[Path]:
         run = self.run
         presentation = self.presented.presentation
@@ -453,9 +433,8 @@ _WRITERS: dict[str, Callable[[_Exporter], list[Path]]] = {
     "splat-glb": _Exporter.splat_glbs,
     "splat-usdz": _Exporter.splat_usdz,
     "mesh": _Exporter.mesh,
-    **{kind: partial(_Exporter.model, kind=kind) for kind in ("glb", "obj", "usdz")},
+    **{kind: partial(_Exporter.model, kind=kind) for kind in ("glb", "usdz")},
     "stl": _Exporter.stl,
-    "points": _Exporter.points,
     "environment": _Exporter.environment,
     "cameras": _Exporter.cameras,
     "all": _Exporter.all,
