@@ -20,6 +20,7 @@ from polarguide.core.options import (
     ComputeOptions,
     ExportFormat,
     ModelOptions,
+    NormalOptions,
     PictureFormat,
     PlyFields,
     SceneOptions,
@@ -378,6 +379,7 @@ def export_run(
     fields: PlyFields = "release",
     axes: Axes = "upright",
     model: Annotated[ModelOptions, tyro.conf.arg(name="")] = ModelOptions(),
+    normals: Annotated[NormalOptions, tyro.conf.arg(name="")] = NormalOptions(),
     machine: ThreadOptions = ThreadOptions(),
 ) -> None:
     """Export a run to the file formats of other programs.
@@ -386,11 +388,12 @@ def export_run(
     from rendered depth and has diffuse colors and learned normals. The textured model (glb, usdz) is for Blender, game
     engines and viewers. Its base color has no highlights and no shading. Its closed surface (stl) is for 3D printing.
     The environment is the learned light as a panorama (EXR, HDR and PNG). The cameras are a COLMAP model and
-    transforms.json. The choice all is a package of most of these.
+    transforms.json. The normals are poses, pictures and normal maps for trainers with a normal loss. The choice all is
+    a package of most of these.
 
     Args:
         run: Run folder.
-        format: ply, spz, sog, splat-glb, splat-usdz, mesh, glb, usdz, stl, environment, cameras or all.
+        format: ply, spz, sog, splat-glb, splat-usdz, mesh, glb, usdz, stl, environment, cameras, normals or all.
         out: Folder to write; default: RUN/export.
         resolution: Voxels of the mesh along its longest side.
         spz_version: Version of the SPZ file; programs support only one of the two.
@@ -409,6 +412,7 @@ def export_run(
         fields=fields,
         axes=axes,
         model=model,
+        normals=normals,
         reporter=reporter,
     ):
         size = f" ({size_text(path.stat().st_size)})" if path.is_file() else ""

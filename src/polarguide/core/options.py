@@ -35,10 +35,13 @@ ExportFormat = Literal[
     "stl",
     "environment",
     "cameras",
+    "normals",
     "all",
 ]
 Axes = Literal["upright", "scene"]
 PlyFields = Literal["release", "all"]
+NormalLayout = Literal["brush", "dn-splatter"]
+TrainingPicture = Literal["photograph", "diffuse", "minimum"]
 BaseColor = Literal["delit", "diffuse", "photographs", "picture"]
 PictureFormat = Literal["png", "exr", "npy"]
 EXPORT_PACKAGES: dict[str, tuple[str, ...]] = {
@@ -240,6 +243,24 @@ class ModelOptions:
     def resolved_base_color(self) -> BaseColor:
         """Kind of base color. The default depends on the option ``unlit``."""
         return self.base_color or ("picture" if self.unlit else "delit")
+
+
+@dataclass(frozen=True)
+class NormalOptions:
+    """Options of normal maps for other trainers (format normals).
+
+    Attributes:
+        layout: Program that reads the folder: brush or dn-splatter.
+        picture: photograph; diffuse: the rendered diffuse layer; minimum: the least light behind a polarizer at any
+            angle.
+    """
+
+    layout: NormalLayout = "brush"
+    picture: TrainingPicture = "photograph"
+
+    def __post_init__(self) -> None:
+        check_choice("layout", self.layout, get_args(NormalLayout))
+        check_choice("picture", self.picture, get_args(TrainingPicture))
 
 
 @dataclass(frozen=True)

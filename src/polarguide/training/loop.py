@@ -124,8 +124,8 @@ class TrainingLoop(Loop):
         )
         if stage.behind is not None and request.normal_rotation_only:
             result = fade_behind(result, *(share * context.reach for share in stage.behind))
-        scales = state.gaussians["log_scales"]
-        step = Step(result, targets, shading, scales, context.extent, context.recipe.ssim_weight, statistic)
+        ssim_weight = context.recipe.ssim_weight
+        step = Step(result, targets, shading, state.gaussians, context.extent, ssim_weight, statistic)
         loss = step_loss(step, stage.weights)
         loss.total.backward()
         for callback in self.callbacks:
