@@ -66,10 +66,14 @@ def in_words(seconds: float) -> str:
 
 LOG_EVERY = 10
 """Number of steps between two lines of the log."""
+CURVE_POINTS = 10
+"""Number of scores of held-out views in the log of a training."""
 SMOOTHING = 0.98
 """Weight of earlier steps in the displayed loss and PSNR."""
 Ends = Callable[[], bool]
 """Function that returns True to end the training."""
+HeldOutScore = Callable[[], float | None]
+"""Function that returns the mean PSNR of a few held-out views in dB; None if it examines no view."""
 Look = Callable[[Ends], None]
 """Function that runs between two steps, such as a viewer. Its argument returns True when the training should end."""
 
@@ -95,12 +99,17 @@ class Progress(Callback[Loop]):
         advance: function that receives progress.
         log: log of the run.
         stopwatch: stopwatch of the training.
+        held_out: function that scores held-out views, ``CURVE_POINTS`` times in a training. The scores go to the log;
+            no decision uses them.
     """
 
-    def __init__(self, advance: Advance, log: RunLog, stopwatch: Stopwatch) -> None:
+    def __init__(
+        self, advance: Advance, log: RunLog, stopwatch: Stopwatch, held_out: HeldOutScore = lambda: None
+    ) -> None:
         self._advance = advance
         self._log = log
         self._stopwatch = stopwatch
+        self._held_out = held_out
         self._smooth: Tensor | None = None
         self._began = stopwatch.read()[0]
         self._first = -1
@@ -116,6 +125,10 @@ class Progress(Callback[Loop]):
             return
         loss, psnr = self.read()
         seconds, alone = self._stopwatch.read()
+        held_out = None
+        if report.done * CURVE_POINTS // loop.total > (report.done - LOG_EVERY) * CURVE_POINTS // loop.total:
+            with self._stopwatch.paused():
+                held_out = self._held_out()
         self._log.append(
             step=report.step,
             stage=report.stage,
@@ -124,6 +137,7 @@ class Progress(Callback[Loop]):
             gaussians=report.gaussians,
             seconds=round(seconds, 3),
             alone=alone,
+            **({} if held_out is None else {"held_out": round(held_out, 3)}),
         )
 
     def read(self) -> tuple[float, float]:
@@ -254,6 +268,7 @@ def run_to_the_end(
     should_stop: Ends,
     look: Look | None,
     planned: int,
+    held_out: HeldOutScore = lambda: None,
 ) -> None:
     """Train to the end with progress, checkpoints and a log.
 
@@ -265,6 +280,7 @@ def run_to_the_end(
         should_stop: function that returns True to end the training.
         look: function that is called between steps, such as a viewer. None means that no function is called.
         planned: memory in bytes that the process may use.
+        held_out: function that scores held-out views for the log.
 
     Raises:
         TrainingStopped: ``should_stop`` returned True; the state is saved.
@@ -274,7 +290,7 @@ def run_to_the_end(
     stopwatch = Stopwatch(*log.elapsed())
     stop = Stop(should_stop)
     with reporter.track("training", loop.total) as advance:
-        progress = Progress(advance, log, stopwatch)
+        progress = Progress(advance, log, stopwatch, held_out)
         checkpoints = Checkpoints(out, session, progress, stopwatch)
         viewing = [] if look is None else [Viewing(look, should_stop, stopwatch)]
         memory = MemoryLimit(MemoryBound(planned))

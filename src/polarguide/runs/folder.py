@@ -310,6 +310,7 @@ class _Row(msgspec.Struct):
     seconds: Annotated[float, msgspec.Meta(ge=0)] = 0.0
     alone: bool = True
     psnr: float | None = None
+    held_out: float | None = None
 
 
 _ROWS = msgspec.json.Decoder(_Row)

@@ -32,7 +32,14 @@ from polarguide.runs.folder import (
     resolve,
     writing_to,
 )
-from polarguide.runs.health import HealthCheck, MetalReport, PlyFile, PolarizerReport, RecordedWarnings
+from polarguide.runs.health import (
+    HealthCheck,
+    MetalReport,
+    PlyFile,
+    PolarizerReport,
+    RecordedWarnings,
+    held_out_score,
+)
 from polarguide.runs.memory_plan import MemoryPlan, pixels_of, plan_memory
 from polarguide.runs.model import GaussianModel
 from polarguide.runs.opened import OpenedRun, read_scene, trained_scene
@@ -121,7 +128,7 @@ def train_gaussians(
                 PlyFile(out),
                 HealthCheck(out, fits, recorded),
             ]
-            run_to_the_end(loop, out, session, reporter, should_stop, look, plan.peak)
+            run_to_the_end(loop, out, session, reporter, should_stop, look, plan.peak, held_out_score(loop))
         model = GaussianModel.of(loop.state, method, resolved, backend)
     return OpenedRun(out, configuration, method, model, scene=original, reporter=reporter)
 
