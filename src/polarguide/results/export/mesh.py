@@ -1,14 +1,17 @@
-"""Export of a scene's surface as a triangle mesh."""
+"""Export of a scene's surface as a triangle mesh, and of points."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.lib.recfunctions import unstructured_to_structured
+from numpy.typing import NDArray
 from plyfile import PlyData, PlyElement
+from torch import Tensor
 
 from polarguide.core.files import atomic
 from polarguide.geometry.scene_frame import SceneFrame
@@ -60,13 +63,33 @@ def write_mesh(
     points = placement.points(torch.from_numpy(surface.vertices))
     normals = placement.directions(torch.from_numpy(surface.normals))
     colors = srgb_encode(torch.from_numpy(mesh.colors))
+    write_points(path, points, normals, colors, comments(origin, placement), surface.faces)
+
+
+def write_points(
+    path: Path,
+    points: Tensor,
+    normals: Tensor,
+    colors: Tensor,
+    remarks: Sequence[str],
+    faces: NDArray[np.integer[Any]] | None = None,
+) -> None:
+    """Write points, and optionally the triangles between them, as a PLY file.
+
+    Args:
+        path: the file.
+        points: [N, 3] positions.
+        normals: [N, 3] unit normals; zero if unknown.
+        colors: [N, 3] sRGB colors in [0, 1].
+        remarks: comments of the file.
+        faces: [F, 3] indices of the points of each triangle.
+    """
     values = np.concatenate((points.numpy(), normals.numpy(), np.rint(colors.numpy() * 255)), axis=1)
     table = unstructured_to_structured(values, np.dtype(FIELDS))
-    rows = surface.faces.astype("<i4").view([("vertex_indices", "<i4", (3,))])[:, 0]
-    elements = [
-        PlyElement.describe(table, "vertex", comments=comments(origin, placement)),
-        PlyElement.describe(rows, "face"),
-    ]
+    elements = [PlyElement.describe(table, "vertex", comments=list(remarks))]
+    if faces is not None:
+        rows = faces.astype("<i4").view([("vertex_indices", "<i4", (3,))])[:, 0]
+        elements.append(PlyElement.describe(rows, "face"))
     with atomic(path) as temporary:
         PlyData(elements, byte_order="<").write(temporary)
 
