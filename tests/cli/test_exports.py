@@ -122,8 +122,9 @@ def test_splats_are_upright_and_of_the_subject(
     np.testing.assert_allclose(np.sort(up), np.sort(heights), atol=0.02, rtol=2e-3)
 
 
-def test_environment(trained: Path, tmp_path: Path) -> None:
+def test_environment(trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("OpenEXR")
+    monkeypatch.setattr("polarguide.results.export.formats.PANORAMA_HEIGHT", 128)
     exported(trained, tmp_path, "environment")
     assert {p.name for p in tmp_path.iterdir()} == {"environment.exr", "environment.hdr", "environment.png"}
     flags = ["--views", "v000", "--layers", "final,specular", "--out", str(tmp_path / "a")]
