@@ -22,7 +22,8 @@ if TYPE_CHECKING:
     from polarguide.geometry.camera import Camera
     from polarguide.inspection.settings import InspectSettings
     from polarguide.preparation.settings import PrepareSettings
-    from polarguide.recipes.registry import recipe_names
+    from polarguide.recipes.registry import recipes
+    from polarguide.results.evaluation.metric import Metric
     from polarguide.training.recipe import Recipe
     from polarguide.training.settings import TrainSettings
     from polarguide_bench.compare import ablate, compare
@@ -48,7 +49,7 @@ _NAMES = {
     "polarguide.geometry.camera": ("Camera",),
     "polarguide.inspection.settings": ("InspectSettings",),
     "polarguide.preparation.settings": ("PrepareSettings",),
-    "polarguide.recipes.registry": ("recipe_names",),
+    "polarguide.results.evaluation.metric": ("Metric",),
     "polarguide.training.recipe": ("Recipe",),
     "polarguide.training.settings": ("TrainSettings",),
     "polarguide_bench.compare": ("ablate", "compare"),
@@ -71,6 +72,7 @@ __all__ = [
     "CompareOptions",
     "InspectSettings",
     "MeasureOptions",
+    "Metric",
     "PolarguideError",
     "PolarguideWarning",
     "PrepareSettings",
@@ -101,7 +103,7 @@ __all__ = [
     "priors",
     "read_analyzers",
     "read_shot",
-    "recipe_names",
+    "recipes",
     "shot_priors",
     "surface_maps",
     "train",
@@ -112,8 +114,8 @@ __all__ = [
 def __getattr__(name: str) -> Any:
     if name == "__version__":
         value: Any = _version()
-    elif name == "optics":
-        return importlib.import_module("polarguide.optics")
+    elif name in ("optics", "recipes"):
+        return importlib.import_module(f"polarguide.{name}")
     elif name in _MODULES:
         value = getattr(_imported(_MODULES[name], name), name)
     else:
@@ -139,7 +141,7 @@ def _imported(module: str, name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted({*__all__, *(name for name in globals() if name.startswith("__"))})
+    return sorted(__all__)
 
 
 def _version() -> str:

@@ -54,7 +54,7 @@ class Capture:
         name: name of the capture's folder in the results.
         path: folder with the files of the capture, or a scene folder.
         prepare: settings of the preparation, which a scene does not need.
-        recipe: recipe of the training.
+        recipes: recipes, each of which trains on the capture.
         settings: settings of the training.
         reading: options for reading the scene.
     """
@@ -62,7 +62,7 @@ class Capture:
     name: str
     path: Path
     prepare: PrepareSettings = field(default_factory=PrepareSettings)
-    recipe: str = "polarguide-stokes"
+    recipes: tuple[str, ...] = ("polarguide-stokes",)
     settings: TrainSettings = TrainSettings()
     reading: SceneOptions = SceneOptions()
 
@@ -248,15 +248,36 @@ class Scoring(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="scor
 
 
 class Processing(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag="process"):
-    """Task that performs the remaining steps of a capture."""
+    """Task that performs the remaining steps of a capture with one recipe.
+
+    Attributes:
+        name: name of the capture.
+        folder: folder of the results.
+        request: inputs of the capture.
+        compute: device and threads.
+        first: folder of the task of the same capture that prepares and inspects the scene. It is empty for this task.
+    """
 
     name: str
     folder: str
     request: Request
     compute: ComputeOptions
+    first: str = ""
 
 
 Task = Training | Scoring | Processing
+
+
+class Definitions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Recipes and metrics of a user, which no package provides.
+
+    Attributes:
+        path: folders in which the sender looks for modules.
+        data: the pickled recipes and metrics.
+    """
+
+    path: tuple[str, ...]
+    data: bytes
 
 
 class Message(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -266,11 +287,13 @@ class Message(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         task: the task.
         files: ``files_digest`` of the sender.
         code: ``code_digest`` of the sender. Its computation takes seconds, so it is compared only if ``files`` differs.
+        definitions: recipes and metrics that the sender has registered, if any.
     """
 
     task: Task
     files: str
     code: str
+    definitions: Definitions | None = None
 
     def to_line(self) -> bytes:
         """Return the message as one line of JSON. File names that are not valid Unicode are escaped."""

@@ -14,7 +14,9 @@ import msgspec
 from msgspec import UNSET
 
 from polarguide import __version__
+from polarguide.capture import Scene
 from polarguide.capture.layout import refuse_scene
+from polarguide.capture.scene import IN_MEMORY
 from polarguide.capture.variants import EVERY
 from polarguide.core.errors import require
 from polarguide.core.files import check_out, make_folder, require_inside, write_text
@@ -23,19 +25,22 @@ from polarguide.core.options import (
     ComputeOptions,
     Exposures,
     PathLike,
+    SceneOptions,
     check_choice,
     check_count,
     index_of,
 )
-from polarguide.core.progress import SILENT, Reporter
+from polarguide.core.progress import Reporter, notebook_reporter
 from polarguide.core.records import decode
 from polarguide.core.system import only_writer
 from polarguide.raster import choose_backend
 from polarguide.results.evaluation.record import code_digest, commit
-from polarguide.results.evaluation.table import COLUMNS, PART_METRICS
+from polarguide.results.evaluation.table import COLUMNS, PART_METRICS, Metric, register_metric
 from polarguide.training.settings import TrainSettings
 from polarguide_bench.children import Scoring, Task, Training
+from polarguide_bench.figures import write_figures
 from polarguide_bench.job_queue import Job, run_job, run_jobs, workers
+from polarguide_bench.objects import chosen_recipes
 from polarguide_bench.options import MOST_SEEDS, CompareOptions
 from polarguide_bench.plan import (
     Comparison,
@@ -48,7 +53,7 @@ from polarguide_bench.plan import (
     plan_runs,
     scene_entries,
 )
-from polarguide_bench.recipes import ABLATIONS, AnyRecipe, ablations_of, recipe_named
+from polarguide_bench.recipes import ABLATIONS, AnyRecipe, ablations_of
 from polarguide_bench.report import exposure_svg, read_study, study_svg, write_report
 from polarguide_bench.results import (
     FORMAT,
@@ -67,37 +72,40 @@ BESIDE_OTHERS = "beside_others.txt"
 
 
 def compare(
-    scenes: Sequence[PathLike],
+    scenes: Sequence[PathLike | Scene],
     recipes: Sequence[str | AnyRecipe],
-    out: PathLike,
+    out: PathLike = "results",
     *,
+    metrics: Sequence[Metric] = (),
     settings: TrainSettings = TrainSettings(),
     options: CompareOptions = CompareOptions(),
     seeds_of: Mapping[str, int] = MappingProxyType({}),
     steps_of: Mapping[str, int] = MappingProxyType({}),
     command_line: str = "",
-    reporter: Reporter = SILENT,
+    reporter: Reporter | None = None,
 ) -> Results:
     """Train and score each recipe on each scene with each seed, each run in its own processes.
 
-    Writes ``results.json``, ``.md``, ``.csv``, ``.tex`` and ``report.html`` to ``out``, and the runs to its ``runs/``.
-    If there are paired differences, they are written to ``differences.csv``. If there are scores by object and
-    material, they are written to ``parts.csv``. With ``options.exposures``, ``exposures.svg`` shows the scores over the
-    number of pictures.
+    Writes tables (``results.json``, ``.md``, ``.csv`` and ``.tex``), figures (``results.pdf`` and ``.svg``) and
+    ``report.html`` to ``out``, and the runs to its ``runs/``. If there are paired differences, they are written to
+    ``differences.csv``. If there are scores by object and material, they are written to ``parts.csv``. With
+    ``options.exposures``, ``exposures.svg`` shows the scores over the number of pictures.
 
     Finished runs are not repeated. After a KeyboardInterrupt active runs save their states, and the same call resumes.
 
     Args:
-        scenes: scene folders with unique names.
-        recipes: names of the recipes, or registered recipes, in the order of the tables.
+        scenes: scene folders, or scenes read from folders, with unique names.
+        recipes: recipes or their names, in the order of the tables. A recipe with a new name is known by this name in
+            this process afterwards.
         out: output folder.
+        metrics: additional metrics of views. They belong to all later scores of this process.
         settings: settings of each training. ``seed`` is the first of ``options.seeds``. The default of the steps is
             5,000, so that scenes of different sizes are comparable. Other defaults are those of ``train``.
         options: options for training, timing and presentation.
         seeds_of: number of seeds of each recipe for which it differs from ``options.seeds``.
         steps_of: number of steps of each recipe for which it differs from ``settings.steps``.
         command_line: command line to record if it differs from ``polarguide compare``.
-        reporter: receives messages and progress.
+        reporter: receives messages and progress. By default, a notebook displays them.
 
     Returns:
         The results as data frames. A failed run is listed in ``runs`` with its error, and does not affect other runs.
@@ -105,9 +113,13 @@ def compare(
     Raises:
         PolarguideError: the input is invalid, or another comparison is writing to ``out``.
     """
+    reporter = notebook_reporter() if reporter is None else reporter
+    options = _read_alike(scenes, options)
+    for metric in metrics:
+        register_metric(metric)
     comparison = Comparison(
-        scenes=tuple(_folder(scene) for scene in scenes),
-        recipes=_checked_recipes(recipes),
+        scenes=tuple(scene.root if isinstance(scene, Scene) else Path(scene) for scene in scenes),
+        recipes=chosen_recipes(recipes),
         settings=settings,
         options=options,
         out=Path(out),
@@ -128,6 +140,7 @@ def compare(
     if options.local:
         choose_backend(options.device)
     entries = scene_entries(comparison, reporter)
+    _require_complete(scenes, entries)
     plan = plan_runs(comparison, entries)
     make_folder(comparison.out)
     require_inside(comparison.out, *(run.folder for run in plan))
@@ -143,22 +156,23 @@ def compare(
 
 
 def ablate(
-    scenes: Sequence[PathLike],
+    scenes: Sequence[PathLike | Scene],
     base: str,
-    out: PathLike,
+    out: PathLike = "results",
     *,
     only: Sequence[str] = (),
     reference: Sequence[str | AnyRecipe] = (),
     settings: TrainSettings = TrainSettings(),
+    metrics: Sequence[Metric] = (),
     options: CompareOptions = CompareOptions(),
-    reporter: Reporter = SILENT,
+    reporter: Reporter | None = None,
 ) -> Results:
     """Compare a recipe with its ablations. Comparisons in the same folder share their runs.
 
     Differences are relative to the recipe, unless ``options.against`` names another reference.
 
     Args:
-        scenes, out, settings, options, reporter: see ``compare``.
+        scenes, out, settings, metrics, options, reporter: see ``compare``.
         base: name of the recipe.
         only: names of the requested ablations, such as without-normals. If empty, all ablations are compared.
         reference: further recipes for the first rows.
@@ -171,20 +185,65 @@ def ablate(
         [*reference, *ablated(base, only)],
         out,
         settings=settings,
+        metrics=metrics,
         options=replace(options, against=options.against or base),
         reporter=reporter,
     )
 
 
-def _folder(scene: PathLike) -> Path:
-    require(
-        isinstance(scene, str | os.PathLike),
-        "scenes",
-        expected="paths of scene folders",
-        found=f"a {type(scene).__name__}",
-        remedy="Pass scene.root: other processes read the scene from its folder.",
-    )
-    return Path(scene)
+def _read_alike(scenes: Sequence[PathLike | Scene], options: CompareOptions) -> CompareOptions:
+    """Return the options with the downscale and the transfer with which all scene objects were read.
+
+    Raises:
+        PolarguideError: an object is not a scene, is not in a folder, or was read in another way.
+    """
+    for scene in scenes:
+        require(
+            isinstance(scene, str | os.PathLike | Scene),
+            "scenes",
+            expected="scenes, or paths of scene folders",
+            found=f"a {type(scene).__name__}",
+            remedy="polarguide.load_scene reads a scene.",
+        )
+        if not isinstance(scene, Scene):
+            continue
+        require(
+            scene.root != IN_MEMORY,
+            "scenes",
+            expected="scenes in folders, because other processes read them",
+            found=f"the scene {scene.name} in memory",
+            remedy="Write its pictures to a folder, and use polarguide.prepare.",
+        )
+        for name, default in (("downscale", SceneOptions.downscale), ("transfer", SceneOptions.transfer)):
+            stated = getattr(options, name)
+            value = getattr(scene, name)
+            require(
+                value == stated or stated == default,
+                "scenes",
+                expected=f"scenes that were read with {name} {stated}",
+                found=f"{scene.name} with {name} {value}",
+                remedy=f"Read all scenes with the same {name}.",
+            )
+            options = replace(options, **{name: value})
+    return options
+
+
+def _require_complete(scenes: Sequence[PathLike | Scene], entries: Sequence[SceneEntry]) -> None:
+    """Check that each scene object has the files and held-out views of its folder, which the trainings read.
+
+    Raises:
+        PolarguideError: a scene object differs from its folder.
+    """
+    for scene, entry in zip(scenes, entries, strict=True):
+        require(
+            not isinstance(scene, Scene)
+            or (scene.digest, len(scene.views), scene.test_names)
+            == (entry.digest, entry.views, entry.test_views),
+            "scenes",
+            expected=f"{entry.name} as its folder contains it",
+            found="other files, views or held-out views",
+            remedy="Read the whole scene again; split.json lists its held-out views.",
+        )
 
 
 def ablated(base: str, only: Sequence[str] = ()) -> tuple[str, ...]:
@@ -209,30 +268,6 @@ def ablated(base: str, only: Sequence[str] = ()) -> tuple[str, ...]:
     for name in selected:
         check_choice("only", name, names)
     return (base, *(f"{base}:{name}" for name in names if name in selected or not only))
-
-
-def _checked_recipes(recipes: Sequence[str | AnyRecipe]) -> tuple[AnyRecipe, ...]:
-    """Check that recipes are registered, because the processes that train them know recipes only by name."""
-    registered: dict[str, AnyRecipe] = {}
-    for recipe in recipes:
-        own = recipe_named(recipe if isinstance(recipe, str) else recipe.name)
-        require(
-            isinstance(recipe, str) or recipe == own,
-            "recipes",
-            expected=f"the registered recipe {own.name}",
-            found="a recipe of this name with other values",
-            remedy="Rename the recipe, and register it as an entry point of the group polarguide.recipes.",
-        )
-        require(
-            own.name not in registered,
-            "recipes",
-            expected="no name more than once",
-            found=f"{own.name} twice",
-            remedy="List each name once.",
-        )
-        registered[own.name] = own
-    require(registered, "compare", expected="a recipe", found="none", remedy="Name at least one recipe.")
-    return tuple(registered.values())
 
 
 def _train(
@@ -430,7 +465,7 @@ def _run_record(comparison: Comparison, run: PlannedRun, failure: str | None) ->
 
 
 def _write_charts(comparison: Comparison, scenes: Sequence[SceneEntry], results: Results) -> None:
-    """Write charts: ``study.svg`` for a family of scenes, and ``exposures.svg`` for several kinds of captures."""
+    """Write the figures, and charts of a family of scenes and of several kinds of captures."""
     drawn = {"study.svg": study_svg(results, {scene.name: read_study(scene.path) for scene in scenes})}
     if len(comparison.options.exposures) > 1:
         counts = {
@@ -442,6 +477,7 @@ def _write_charts(comparison: Comparison, scenes: Sequence[SceneEntry], results:
     for name, text in drawn.items():
         if text is not None:
             write_text(comparison.out / name, text)
+    write_figures(comparison.out, results)
 
 
 def count_of(exposures: Exposures, views: int) -> int:

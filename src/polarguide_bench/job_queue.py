@@ -36,6 +36,7 @@ from polarguide_bench.children import (
     kill,
     perform,
 )
+from polarguide_bench.objects import packed_definitions
 from polarguide_bench.options import ClusterOptions
 
 if TYPE_CHECKING:
@@ -343,9 +344,10 @@ def run_jobs(
 
 
 def _submit(job: Job, workers: Workers, reporter: Reporter, stack: contextlib.ExitStack) -> _ActiveJob:
+    definitions = packed_definitions()
     future = workers.client.submit(
         perform,
-        tuple(Message(task, files_digest(), code_digest()) for task in job.tasks()),
+        tuple(Message(task, files_digest(), code_digest(), definitions) for task in job.tasks()),
         str(job.folder.absolute()),
         gpus=workers.gpus,
         key=f"{job.label} {time.monotonic_ns()}",

@@ -29,6 +29,7 @@ from polarguide.core.progress import SILENT, Reporter
 from polarguide.core.system import free_memory
 from polarguide.raster import Backend
 from polarguide.results.evaluation.record import PACKAGE, _digest, code_digest, read_metrics
+from polarguide.results.evaluation.table import registered_digests
 from polarguide.results.evaluation.target import SceneFacts
 from polarguide.runs.folder import CHECKPOINT, CONFIGURATION, PLY, RunConfiguration, most_gaussians
 from polarguide.runs.memory_plan import pixels_of, plan_memory
@@ -36,6 +37,7 @@ from polarguide.runs.opened import OpenedRun, read_scene
 from polarguide.training.recipe import Recipe
 from polarguide.training.settings import STEPS, TrainSettings
 from polarguide_bench.gnerp.runs import FieldRun, open_field, plan_field_memory
+from polarguide_bench.objects import recipe_digest
 from polarguide_bench.options import ClusterOptions, CompareOptions
 from polarguide_bench.recipes import AnyRecipe, ablations_of, recipe_named
 
@@ -224,7 +226,9 @@ class PlannedRun:
             record = read_metrics(self.folder)
         except (OSError, PolarguideError):
             return None
-        current = record["provenance"].get("sources") == code_digest()
+        provenance = record["provenance"]
+        scored = registered_digests().items() <= provenance.get("metrics", {}).items()
+        current = provenance.get("sources") == code_digest() and scored
         return record if record["steps"] == self.steps and current else None
 
 
@@ -305,12 +309,18 @@ def _planned(comparison: Comparison, scene: SceneEntry, row: TableRow, seed: int
         refractive_index=index_of(comparison.settings.refractive_index, scene.refractive_index),
     )
     reading = SceneOptions(options.downscale, options.transfer, split=options.split)
-    plugin = model_digest(type(recipe.shading)) if isinstance(recipe, Recipe) else ""
+    plugin = recipe_digest(recipe)
+    if isinstance(recipe, Recipe) and not plugin:
+        plugin = model_digest(type(recipe.shading))
     code = f"{__version__} {code_digest(training=True)}{plugin}"
     key = run_key(scene.digest, recipe.data(), settings, reading, code=code)
-    name = row.name.replace(":", "__").replace(" ", "-")
-    folder = comparison.out / "runs" / scene.name / name / f"{seed}-{key}"
+    folder = comparison.out / "runs" / scene.name / folder_of_recipe(row.name) / f"{seed}-{key}"
     return PlannedRun(scene, row, steps, settings, reading, folder)
+
+
+def folder_of_recipe(name: str) -> str:
+    """Return the name of the folder for a recipe or for a row of the tables."""
+    return name.replace(":", "__").replace(" ", "-")
 
 
 def run_key(

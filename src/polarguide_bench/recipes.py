@@ -31,6 +31,7 @@ from polarguide.recipes.registry import (
 )
 from polarguide.training.recipe import Recipe, Weights
 from polarguide_bench.gnerp.recipe import FieldRates, FieldShape, NeuralRecipe, Sampling
+from polarguide_bench.polgs import RECIPE_POLGS
 
 AnyRecipe = Recipe | NeuralRecipe
 """Recipe of a comparison."""
@@ -259,6 +260,16 @@ ABLATIONS_STOKES = varied(
     *_COMMON,
 )
 
+ABLATIONS_POLGS = varied(
+    RECIPE_POLGS,
+    (
+        "strength",
+        "Each Gaussian learns how strongly it reflects.",
+        shading(first_strength=0.5),
+    ),
+    ("unpolarized", "The same without S1 and S2.", off("polarization")),
+)
+
 RECIPE_GNERP = NeuralRecipe(
     name="gnerp",
     about="A signed-distance field (dense grids) with color and angle of polarization.",
@@ -292,14 +303,18 @@ ABLATIONS: dict[str, tuple[AnyRecipe, ...]] = {
     "polarguide-paper:kind": ABLATIONS_KIND,
     "polarguide": ABLATIONS_POLARGUIDE,
     "polarguide-stokes": ABLATIONS_STOKES,
+    "polgs": ABLATIONS_POLGS,
     "gnerp": ABLATIONS_GNERP,
 }
 """Ablations of each recipe, by the name of the recipe. An ablation is named ``recipe:variation``."""
 
 VARIATIONS: dict[str, Recipe] = {
-    recipe.name: recipe for recipes in ABLATIONS.values() for recipe in recipes if isinstance(recipe, Recipe)
+    recipe.name: recipe
+    for recipes in ((RECIPE_POLGS,), *ABLATIONS.values())
+    for recipe in recipes
+    if isinstance(recipe, Recipe)
 }
-"""All ablations of Gaussian recipes by name. polarguide looks up names with a colon here."""
+"""Ablations of Gaussian recipes, and the baselines of this package, by name. polarguide looks up other names here."""
 
 
 def recipe_named(name: str) -> AnyRecipe:

@@ -11,7 +11,7 @@ import shlex
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
@@ -135,12 +135,21 @@ def chart(
 
 
 class Curve(NamedTuple):
-    """Training curve of a run: smoothed PSNR in dB [P], with steps [P] and seconds [P]."""
+    """Training curve of a run.
+
+    Attributes:
+        name: name of the run.
+        steps: [P] steps.
+        seconds: [P] seconds.
+        psnr: [P] smoothed PSNR of the training views in dB.
+        held_out: [Q, 3] steps, seconds, and mean PSNR of a few held-out views. Q is 0 if none was scored.
+    """
 
     name: str
     steps: Numbers
     seconds: Numbers
     psnr: Numbers
+    held_out: Numbers
 
 
 def read_curve(run: Path, name: str) -> Curve | None:
@@ -148,13 +157,19 @@ def read_curve(run: Path, name: str) -> Curve | None:
 
     Return None for fewer than two points.
     """
-    measured = [(row["step"], row.get("seconds"), row.get("psnr")) for row in RunLog(run).rows()]
-    rows = [row for row in measured if None not in row]
-    if len(rows) < 2:
+    rows = RunLog(run).rows()
+    steps, seconds, psnr = _logged(rows, "psnr").T
+    if len(steps) < 2:
         return None
-    steps, seconds, psnr = np.array(rows, np.float64).T
-    index = np.unique(np.linspace(0, len(rows) - 1, POINTS).round().astype(int))
-    return Curve(name, steps[index] + 1, seconds[index], smoothed(psnr, SMOOTHED_SHARE)[index])
+    index = np.unique(np.linspace(0, len(steps) - 1, POINTS).round().astype(int))
+    means = smoothed(psnr, SMOOTHED_SHARE)[index]
+    return Curve(name, steps[index], seconds[index], means, _logged(rows, "held_out"))
+
+
+def _logged(rows: Sequence[Mapping[str, Any]], field: str) -> Numbers:
+    """Return the number of finished steps, the seconds, and a field of the rows that have it, [P, 3]."""
+    values = [(row["step"] + 1, row["seconds"], row[field]) for row in rows if row[field] is not None]
+    return np.array(values, np.float64).reshape(-1, 3)
 
 
 def smoothed(values: Numbers, share: float) -> Numbers:
@@ -171,12 +186,21 @@ def smoothed(values: Numbers, share: float) -> Numbers:
 
 
 def curves_svg(curves: Sequence[Curve], axis: str) -> str:
-    """Draw PSNR over ``axis`` ("steps" or "seconds") as an SVG element in the colors of the surrounding page."""
+    """Draw PSNR over ``axis`` ("steps" or "seconds") as an SVG element in the colors of the surrounding page.
+
+    A second panel shows the held-out views if at least one curve has two points there.
+    """
     series = [
         Series(c.name, [(x, y, "") for x, y in zip(getattr(c, axis), c.psnr, strict=True)]) for c in curves
     ]
-    axes = panel("PSNR (dB), training views", axis, series)
-    return chart([axes], (), label=f"PSNR over {axis}", size=(860, 340))
+    panels = [panel("PSNR (dB), training views", axis, series)]
+    column = ("steps", "seconds").index(axis)
+    held_out = [
+        Series(c.name, [(p[column], p[2], f"{c.name}: {p[2]:.2f} dB") for p in c.held_out]) for c in curves
+    ]
+    if any(len(each.points) > 1 for each in held_out):
+        panels.append(panel("PSNR (dB), a few held-out views", axis, held_out))
+    return chart(panels, (), label=f"PSNR over {axis}", size=(860 // len(panels), 340))
 
 
 def read_study(scene: Path) -> tuple[str, float] | None:

@@ -507,8 +507,6 @@ def differences(record: Record, compared: Sequence[Metric]) -> list[dict[str, An
     return rows
 
 
-COMPARED = tuple(column for column in COLUMNS if column.better is not None and not column.timed)
-"""Metrics whose differences are computed. Their better direction is known, and they do not depend on the machine."""
 DIFFERENCE_FIELDS = (
     "scene", "recipe", "other", "why", "metric", "mean", "low", "high", "over", "count", "seeds", "noise",
 )  # fmt: skip
@@ -619,8 +617,11 @@ class Results:
 
     @cached_property
     def compared(self) -> list[dict[str, Any]]:
-        """Differences between recipes in the format of ``results.json``."""
-        return differences(self.record, COMPARED)
+        """Differences between recipes in the format of ``results.json``.
+
+        The better direction of the compared metrics is known, and they do not depend on the machine.
+        """
+        return differences(self.record, [c for c in COLUMNS if c.better is not None and not c.timed])
 
     @cached_property
     def table(self) -> list[ScoreRow]:

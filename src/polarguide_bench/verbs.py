@@ -237,7 +237,7 @@ def batch(
             the file) and, optionally, sensor and options.
         out: Output folder.
         options: Options of prepare and train for all captures: --options="--poses sfm --steps 3000". Those of a line of
-            the CSV file override them.
+            the CSV file override them. --recipe accepts several recipes.
         watch: Look for new captures every so many seconds, until Ctrl-C, as at a capture station. A capture starts once
             nothing in its folder has changed between two looks.
     """
@@ -248,15 +248,15 @@ def batch(
 
     def process(lines: Sequence[_Line]) -> None:
         module = importlib.import_module("polarguide_bench.batch")
-        captures = [_capture(line, module.is_scene(line.path), options) for line in lines]
+        captures = [_capture(line, module.is_posed_scene(line.path), options) for line in lines]
         rows = module.run_batch(captures, out, settings, reporter=ConsoleReporter())
         say(f"page: {out / 'index.html'}   table: {out / 'results.csv'}")
-        failed = [f"{row.name}: {row.error}" for row in rows if row.state == "failed"]
+        failed = {row.name: f"{row.name}: {row.error}" for row in rows if row.state == "failed"}
         require(
             not failed,
             out,
-            expected=f"{len(rows)} finished captures",
-            found=f"{len(failed)} failed captures ({'; '.join(failed)})",
+            expected=f"{len(captures)} finished captures",
+            found=f"{len(failed)} failed captures ({'; '.join(failed.values())})",
             remedy="All other captures are finished. Remove the cause, and repeat the command.",
         )
 
@@ -397,7 +397,7 @@ def _capture(line: _Line, scene: bool, common: str) -> Capture:
     words += _words(line.options, line.where)
     try:
         prepare, rest = (PrepareSettings(), words) if scene else _parsed(_prepared, words)
-        (recipe, settings, reading), unknown = _parsed(_trained, rest)
+        (recipes, settings, reading), unknown = _parsed(_trained, rest)
     except SystemExit:
         unknown = words
     except PolarguideError as error:
@@ -412,7 +412,7 @@ def _capture(line: _Line, scene: bool, common: str) -> Capture:
         found=shlex.join(words),
         remedy="polarguide train --help and polarguide prepare --help list them.",
     )
-    return Capture(line.name, line.path, prepare, recipe, settings, reading)
+    return Capture(line.name, line.path, prepare, recipes, settings, reading)
 
 
 def _words(text: str, where: str) -> list[str]:
@@ -446,8 +446,8 @@ def _prepared(
 
 
 def _trained(
-    recipe: str = "polarguide-stokes",
+    recipe: tuple[str, ...] = Capture.recipes,
     settings: TrainSettings = TrainSettings(),
     reading: SceneOptions = SceneOptions(),
-) -> tuple[str, TrainSettings, SceneOptions]:
+) -> tuple[tuple[str, ...], TrainSettings, SceneOptions]:
     return recipe, settings, reading

@@ -56,6 +56,7 @@ from polarguide_bench.children import (
     prepare_settings,
 )
 from polarguide_bench.gnerp.runs import FieldRun, train_field
+from polarguide_bench.objects import register_definitions
 from polarguide_bench.plan import open_compared
 from polarguide_bench.recipes import recipe_named
 
@@ -74,7 +75,9 @@ def process(task: Processing) -> None:
     make_folder(folder)
     record = CaptureRecord.load(folder) or CaptureRecord(FORMAT, task.request)
     record.require(task.request, folder)
-    scene = Path(task.request.source) if task.request.prepare is None else folder / "scene"
+    scene = Path(task.request.source)
+    if task.request.prepare is not None:
+        scene = Path(task.first or folder) / "scene"
     for step in STEPS:
         if step not in record.done:
             record = msgspec.structs.replace(record, at=step)
@@ -85,7 +88,7 @@ def process(task: Processing) -> None:
 
 
 def _prepare(task: Processing, scene: Path, folder: Path) -> None:
-    if task.request.prepare is not None:
+    if task.request.prepare is not None and not task.first:
         prepared = prepare_scene(task.request.source, scene, prepare_settings(task.request.prepare))
         require(
             prepared.posed,
@@ -97,6 +100,9 @@ def _prepare(task: Processing, scene: Path, folder: Path) -> None:
 
 
 def _inspect(task: Processing, scene: Path, folder: Path) -> dict[str, Any]:
+    first = CaptureRecord.load(Path(task.first)) if task.first else None
+    if first is not None:
+        return {"verdict": first.verdict, "findings": first.findings}
     out = folder / INSPECTION
     settings = InspectSettings(
         refractive_index=task.request.settings.refractive_index, transfer=task.request.reading.transfer
@@ -203,6 +209,8 @@ def obey(line: bytes) -> int:
                 found=f"polarguide {__version__} with digest {code_digest()} in {Path(__file__).parents[1]}",
                 remedy="Install identical code on all machines, and do not change it while the command runs.",
             )
+        if message.definitions is not None:
+            register_definitions(message.definitions)
         _perform(message.task)
     except PolarguideError as error:
         print(error, file=sys.stderr)

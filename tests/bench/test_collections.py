@@ -18,9 +18,10 @@ from tiny_capture import ideal_intensities, write_tiny_capture
 from polarguide.core.options import SceneOptions
 from polarguide.core.records import decode
 from polarguide.preparation.settings import PrepareSettings
+from polarguide.runs.folder import RunConfiguration
 from polarguide.training.settings import TrainSettings
 from polarguide_bench import job_queue
-from polarguide_bench.batch import CaptureRow, _task, run_batch
+from polarguide_bench.batch import CaptureRow, _tasks, run_batch
 from polarguide_bench.children import FORMAT, STEPS, Capture, CaptureRecord, Message, prepare_settings
 from polarguide_bench.compare import locked
 from polarguide_bench.options import BatchOptions
@@ -40,7 +41,7 @@ def collection(tmp_path_factory: pytest.TempPathFactory) -> list[Capture]:
     picture = write_tiny_capture(cut).picture("v003", 45)
     picture.write_bytes(picture.read_bytes()[:50])
     empty.mkdir()
-    how: dict[str, Any] = {"recipe": "3dgs", "settings": TrainSettings(20), "reading": SceneOptions()}
+    how: dict[str, Any] = {"recipes": ("3dgs",), "settings": TrainSettings(20), "reading": SceneOptions()}
     return [Capture(path.name, path, **how) for path in (good, cut, empty)]
 
 
@@ -96,14 +97,34 @@ def test_broken_captures_are_rows_and_the_others_go_on_also_after_a_stop(
     # Finished captures are not repeated; other options for them, or other files, are refused by name.
     run_batch(collection[:1], tmp_path, OPTIONS, reporter=heard)
     assert heard.said[-1] == "captures: 1, of them finished before: 1"
-    other = _task(replace(collection[0], settings=TrainSettings(30)), tmp_path, OPTIONS)
+    other = _tasks(replace(collection[0], settings=TrainSettings(30)), tmp_path, OPTIONS)[0]
     Fault(str(good), "(settings)", "other values").raised_by(rows[0].record.require, other.request, good)
+
+    # Another recipe trains on the prepared scene, and has a row of its own.
+    several = [replace(collection[0], recipes=("3dgs", "ref-gs"))]
+    rows = run_batch(several, tmp_path, OPTIONS)
+    assert [(row.name, row.recipe, row.state) for row in rows] == [
+        ("good", "3dgs", "done"), ("good", "ref-gs", "done"),
+    ]  # fmt: skip
+    assert (good / "inspection" / "inspection.html").stat().st_mtime_ns == page
+    assert rows[1].record.verdict == rows[0].record.verdict != ""
+    assert (tmp_path / "captures-ref-gs" / "good" / "share.html").exists()
+    assert RunConfiguration.load(tmp_path / "captures-ref-gs" / "good" / "run").recipe == "ref-gs"
+    table = pd.read_csv(tmp_path / "results.csv")
+    assert table["recipe"].tolist() == ["3dgs", "ref-gs"]
+    assert table["psnr"].notna().all()
 
 
 def test_two_in_one_folder_exclude_each_other(collection: list[Capture], tmp_path: Path) -> None:
     with locked(tmp_path, "batch"):
         Fault("", "no other command").raised_by(run_batch, collection, tmp_path, OPTIONS)
-    Fault("recipe").raised_by(run_batch, [replace(collection[0], recipe="magic")], tmp_path / "new", OPTIONS)
+    Fault("recipe").raised_by(
+        run_batch, [replace(collection[0], recipes=("magic",))], tmp_path / "new", OPTIONS
+    )
+    twice = replace(collection[0], recipes=("3dgs", "3dgs"))
+    Fault("good (recipe)", "different recipes", "3dgs 3dgs").raised_by(
+        run_batch, [twice], tmp_path / "new", OPTIONS
+    )
     assert not (tmp_path / "new").exists()
 
 
@@ -111,17 +132,17 @@ def test_a_capture_is_known_by_its_content(tmp_path: Path) -> None:
     folder, source = tmp_path / "captures" / "a", tmp_path / "a"
     (source / "0").mkdir(parents=True)
     (source / "0" / "v.png").write_bytes(b"123")
-    begun = _task(Capture("a", source, PrepareSettings()), tmp_path, OPTIONS).request
+    begun = _tasks(Capture("a", source, PrepareSettings()), tmp_path, OPTIONS)[0].request
     record = CaptureRecord(FORMAT, begun)
     folder.mkdir(parents=True)
     record.save(folder)
     os.utime(source / "0" / "v.png", ns=(1, 1))
     moved = source.rename(tmp_path / "moved")
-    again = _task(Capture("a", moved, PrepareSettings()), tmp_path, OPTIONS).request
+    again = _tasks(Capture("a", moved, PrepareSettings()), tmp_path, OPTIONS)[0].request
     assert again.stamp != begun.stamp
     record.require(again, folder)
     (moved / "0" / "v.png").write_bytes(b"124")  # as large
-    changed = _task(Capture("a", moved, PrepareSettings()), tmp_path, OPTIONS).request
+    changed = _tasks(Capture("a", moved, PrepareSettings()), tmp_path, OPTIONS)[0].request
     Fault(str(folder), "(stamp)", "changed files").raised_by(record.require, changed, folder)
     old = CaptureRecord(FORMAT, msgspec.structs.replace(begun, digest=""))  # of an earlier version
     Fault(str(folder), "(stamp)", "changed files").raised_by(old.require, again, folder)
@@ -135,9 +156,10 @@ def test_damaged_health_is_a_remark_of_its_capture(tmp_path: Path, content: str 
         (folder / "run" / "health.json").symlink_to("nowhere")
     else:
         (folder / "run" / "health.json").write_text(content)
-    request = _task(Capture("a", tmp_path, PrepareSettings()), tmp_path, OPTIONS).request
+    request = _tasks(Capture("a", tmp_path, PrepareSettings()), tmp_path, OPTIONS)[0].request
     row = CaptureRow(
         "a",
+        "3dgs",
         "",
         folder,
         "done",
@@ -152,7 +174,7 @@ def test_damaged_health_is_a_remark_of_its_capture(tmp_path: Path, content: str 
 
 def test_settings_survive_their_way(tmp_path: Path) -> None:
     settings = PrepareSettings(sensor="IMX250MYR", dark_frame=tmp_path / "dark.png", poses="sfm").checked()
-    task = _task(Capture("a", tmp_path, settings), tmp_path, OPTIONS)
+    task = _tasks(Capture("a", tmp_path, settings), tmp_path, OPTIONS)[0]
     assert task.request.prepare is not None
     assert prepare_settings(task.request.prepare) == settings
     assert decode(Message(task, "", "").to_line(), Message, "task").task == task

@@ -35,7 +35,7 @@ def pictures(size: tuple[int, int] = (6, 8)) -> dict[str, np.ndarray]:
 def page(name: str = "cup") -> str:
     view, _ = embed(name, name, [Tile(name, pictures(), {"final": name})], 10**6)
     assert view is not None
-    curve = Curve(name, np.array([1.0, 2.0]), np.array([0.1, 0.2]), np.array([20.0, 21.0]))
+    curve = Curve(name, np.array([1.0, 2.0]), np.array([0.1, 0.2]), np.array([20.0, 21.0]), np.empty((0, 3)))
     record = results([run(name, name, 0, psnr=30.0), unfinished(name, "b", 0, name)], command=name)
     return report_html(record, [view], {name: [curve]}, [name])
 

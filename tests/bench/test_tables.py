@@ -374,6 +374,19 @@ def test_a_log_becomes_a_curve(tmp_path: Path) -> None:
     assert read_curve(tmp_path / "none", "a") is None
 
 
+def test_held_out_scores_of_a_log_are_a_second_panel(tmp_path: Path) -> None:
+    rows: list[dict[str, float]] = [{"step": 10 * i + 9, "seconds": i / 2, "psnr": 20.0} for i in range(10)]
+    rows[4]["held_out"] = 25.5
+    rows[9]["held_out"] = 27.5
+    (tmp_path / "log.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    curve = read_curve(tmp_path, "a")
+    assert curve.held_out.tolist() == [[50, 2.0, 25.5], [100, 4.5, 27.5]]
+    assert "PSNR (dB), a few held-out views" in curves_svg([curve], "seconds")
+    assert "PSNR (dB), a few held-out views" not in curves_svg(
+        [curve._replace(held_out=curve.held_out[:1])], "steps"
+    )
+
+
 def test_smoothing_keeps_the_mean_of_noise_and_both_ends() -> None:
     values = np.random.default_rng(0).normal(25.0, 1.0, 2000)
     smooth = smoothed(values, 0.05)

@@ -118,21 +118,13 @@ def test_cameras_without_a_focal_length_are_refused(tmp_path: Path) -> None:
     Fault("image a.png").raised_by(Poses.read, tmp_path, ["a"])
 
 
-def test_a_binary_model_beside_a_text_model_of_other_poses_is_told(capture: TinyCapture) -> None:
+def test_a_text_model_beside_the_binary_one_is_told(capture: TinyCapture) -> None:
     to_binary(capture)
+    assert read_model(capture.root).warnings == ()
     folder = model_folder(capture)
     pycolmap.Reconstruction(str(folder)).write_text(str(folder))
-    assert read_model(capture.root).warnings == ()
-    for name in ("rigs.txt", "frames.txt"):  # which hold the poses, too
-        (folder / name).unlink()
-    lines = (folder / "images.txt").read_text().splitlines()
-    place = next(number for number, line in enumerate(lines) if not line.startswith("#"))
-    cells = lines[place].split()
-    cells[5] = str(float(cells[5]) + 0.01)
-    lines[place] = " ".join(cells)
-    (folder / "images.txt").write_text("\n".join(lines) + "\n")
     (warning,) = read_model(capture.root).warnings
-    assert f"images.txt has other poses or cameras than images.bin ({cells[9]})" in warning
+    assert warning == f"{folder} has two models. images.bin is used, and images.txt is ignored."
 
 
 @pytest.mark.parametrize(("name", "old", "new"), [("cameras", ".5", ",5"), ("images", "0.", "0,")])
@@ -287,6 +279,7 @@ def test_intrinsics_of_pictures_that_were_resized_are_scaled(capture: TinyCaptur
 
 
 def test_points_that_are_not_finite_are_left_out(capture: TinyCapture) -> None:
+    to_binary(capture)
     model = pycolmap.Reconstruction(str(model_folder(capture)))
     model.points3D[3].xyz = np.array([np.nan, 0.0, 0.0])
     model.points3D[4].xyz = np.array([1e300, 0.0, 0.0])

@@ -60,7 +60,7 @@ def test_tables_and_folders_name_captures(
     (tmp_path / "list.csv").write_text(
         "\ufeffName; path; sensor; options\n"
         "cup; shots/cup; imx250myr; --poses none --steps 40 --zero 12\n"
-        f"demo; {demo_scene}; ; --recipe 3dgs --downscale 2\n",
+        f"demo; {demo_scene}; ; --recipe 3dgs ref-gs --downscale 2\n",
         encoding="utf-8",
     )
     out = str(tmp_path / "out")
@@ -68,8 +68,13 @@ def test_tables_and_folders_name_captures(
     cup, demo = asked.pop()
     assert (cup.name, cup.path) == ("cup", tmp_path / "shots" / "cup")
     assert (cup.prepare.sensor, cup.prepare.poses, cup.prepare.calibration.zero) == ("IMX250MYR", "none", 12)
-    assert (cup.settings.steps, cup.recipe) == (40, "polarguide-stokes")
-    assert (demo.path, demo.recipe, demo.settings.steps, demo.reading.downscale) == (demo_scene, "3dgs", 7, 2)
+    assert (cup.settings.steps, cup.recipes) == (40, ("polarguide-stokes",))
+    assert (demo.path, demo.recipes, demo.settings.steps, demo.reading.downscale) == (
+        demo_scene,
+        ("3dgs", "ref-gs"),
+        7,
+        2,
+    )
 
     for name in ("b", "a", ".hidden", "out"):
         (tmp_path / "all" / name).mkdir(parents=True)
@@ -88,7 +93,7 @@ def test_a_watched_folder_is_taken_once_nothing_in_it_changes(
         asked.append([capture.name for capture in captures])
         record: Any = None
         return [
-            CaptureRow(name, "", out, "failed" if name == "b" else "done", "broken", record)
+            CaptureRow(name, "", "", out, "failed" if name == "b" else "done", "broken", record)
             for name in asked[-1]
         ]
 

@@ -13,7 +13,6 @@ import numpy as np
 import pycolmap
 import pytest
 import torch
-from plyfile import PlyData
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 from scipy.spatial import cKDTree
@@ -26,7 +25,6 @@ from polarguide.core.errors import PolarguideWarning, install_package
 from polarguide.gaussians.ply import read_ply
 from polarguide.geometry.camera import seen_at
 from polarguide.geometry.trajectory import camera_record
-from polarguide.results.export import mesh
 from polarguide.results.rendering.film import path_cameras
 from polarguide.results.rendering.subject import subject_of
 from polarguide.runs.folder import CHECKPOINT, CONFIGURATION
@@ -123,23 +121,6 @@ def test_splats_are_upright_and_of_the_subject(
     heights = means[inside] @ opened.frame.up
     up = found[:, 1] if kind == "spz" else -found[:, 1]
     np.testing.assert_allclose(np.sort(up), np.sort(heights), atol=0.02, rtol=2e-3)
-
-
-def test_points_have_unit_normals_and_colors(
-    trained: Path, tmp_path: Path, refused, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    trimesh = pytest.importorskip("trimesh")
-    assert "found none" in refused(
-        "export", trained, "--format", "points", "--out", tmp_path
-    )  # all are faint yet
-    monkeypatch.setattr(mesh, "OPAQUE", 0.02)
-    exported(trained, tmp_path, "points")
-    cloud = trimesh.load_scene(tmp_path / "points.ply").dump()[0]
-    vertices = PlyData.read(tmp_path / "points.ply")["vertex"]
-    normals = np.stack([vertices[name] for name in ("nx", "ny", "nz")], axis=1)
-    assert len(cloud.vertices) == len(normals) > 0
-    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1, atol=1e-4)
-    assert cloud.colors.shape == (len(normals), 4)
 
 
 def test_environment(trained: Path, tmp_path: Path) -> None:

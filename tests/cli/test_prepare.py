@@ -60,7 +60,7 @@ def test_a_dataset_becomes_a_scene_that_trains(tmp_path: Path, capsys: pytest.Ca
     source, scene, out = (str(tmp_path / name) for name in ("in", "scene", "run"))
     assert run(["prepare", source, "--out", scene, "--threads", "1"]) == 0
     printed = " ".join(capsys.readouterr().out.split())
-    assert "4 views, format nersp" in printed
+    assert "4 views of the dataset nersp" in printed
     assert "Four-angle sum check: n/a" in printed
     assert "warning: The sense of nersp's angles is uncertain" in printed
     assert "Angles count clockwise as displayed, by assumption" in printed

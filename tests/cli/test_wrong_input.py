@@ -84,7 +84,6 @@ WRONG = [
     ("calibrate none --out new.safetensors --sensor IMX250MZR", "none", ""),
     (f"{CALIBRATE} --out new.safetensors", "gray", ""),
     (f"{CALIBRATE} --out new.png", "--out", "new.png"),
-    ("inspect gray --fix new --calibration c.safetensors", "--fix", "--calibration"),
     (f"{INSPECT} --steps 0", "--steps", "0"),
     (f"{INSPECT} --downscale -1", "downscale", "-1"),
     (f"{INSPECT} --refractive-index 0.9", "refractive", "0.9"),

@@ -22,9 +22,7 @@ from polarguide.core.system import (
     keep_freed_memory,
     only_writer,
     peak_memory_mib,
-    process_count,
     process_is_alive,
-    process_rank,
     sigterm_kept,
     stop_signals,
 )
@@ -100,38 +98,6 @@ def test_a_terminal_that_goes_away_is_passed_over_where_it_is_ignored(terminal: 
     finally:
         signal.signal(signal.SIGHUP, before)
     assert signal.SIGHUP in stop_signals()
-
-
-@pytest.mark.parametrize(
-    ("world", "rank"),
-    [("many", "0"), ("", "0"), ("2", "first"), ("2", "2"), ("1000000000", "0"), ("-1", "0"), ("\u0662", "0")],
-)
-def test_variables_of_torchrun_that_are_none_are_named(
-    world: str, rank: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("WORLD_SIZE", world)
-    monkeypatch.setenv("RANK", rank)
-    Fault("RANK" if world == "2" else "WORLD_SIZE").raised_by(process_count)
-    assert process_rank() in (0, 2)
-
-
-@pytest.mark.parametrize(
-    ("name", "text"),
-    [("MASTER_ADDR", ""), ("MASTER_PORT", ""), ("MASTER_PORT", "99999999"), ("MASTER_PORT", "x"), ("LOCAL_RANK", "x")],
-)  # fmt: skip
-def test_processes_need_a_place_to_meet(name: str, text: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    two = {
-        "WORLD_SIZE": "2",
-        "RANK": "1",
-        "LOCAL_RANK": "1",
-        "MASTER_ADDR": "127.0.0.1",
-        "MASTER_PORT": "29500",
-    }
-    for key, value in two.items():
-        monkeypatch.setenv(key, value)
-    assert process_count() == 2
-    monkeypatch.setenv(name, text)
-    Fault(name, remedy="torchrun").raised_by(process_count)
 
 
 def test_a_library_that_takes_sigterm_does_not_keep_it() -> None:

@@ -75,9 +75,6 @@ class Gui:
     ) -> Control:
         return self._add(label, initial_value or options[0])
 
-    def add_number(self, label: str, value: float, **_: Any) -> Control:
-        return self._add(label, value)
-
     def add_slider(self, label: str, low: float, high: float, step: float, value: float, **_: Any) -> Control:
         return self._add(label, value)
 
@@ -100,18 +97,6 @@ class SceneTree:
         self.pictures: list[tuple[np.ndarray, str]] = []
         self.frusta: list[Control] = []
         self.boxes: list[np.ndarray] = []
-        self.listeners: list[Callable[[Any], None]] = []
-
-    def on_click(self) -> Callable[[Callable[[Any], None]], None]:
-        return self.listeners.append
-
-    def remove_click_callback(self, callback: Callable[[Any], None]) -> None:
-        self.listeners.remove(callback)
-
-    def click(self, across: float, down: float) -> None:
-        """What a user does with a mouse, in shares of the window."""
-        for listener in list(self.listeners):
-            listener(SimpleNamespace(screen_pos=(across, down)))
 
     def set_background_image(self, image: np.ndarray, format: str, jpeg_quality: int = 0) -> None:
         self.pictures.append((image, format))

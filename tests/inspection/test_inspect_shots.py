@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pytest
 from browsers import chromium
-from faults import Fault
 from reduced_demo import VIEWS
 from single_shots import single_shots
 
@@ -152,12 +151,6 @@ def test_the_checks_fit_a_phone(demo_scene: Path, tmp_path: Path) -> None:
         assert all(300 < cell.bounding_box()["width"] <= 390 for cell in long)
         assert page.evaluate("document.documentElement.scrollWidth") <= 390
         page.close()
-
-
-def test_a_calibration_needs_four_pictures(demo_scene: Path, tmp_path: Path) -> None:
-    scene = single_shots(demo_scene, tmp_path / "shots")
-    settings = InspectSettings(calibration=tmp_path / "none.json")
-    Fault("--calibration").raised_by(polarguide.inspect, scene, tmp_path / "out", settings=settings)
 
 
 def test_ordinary_photographs_are_not_wrong(demo_scene: Path, tmp_path: Path) -> None:

@@ -130,7 +130,7 @@ def names(weights: Weights) -> str:
 
 def step(result: RenderResult, priors: ViewPriors, shading: ShadingModel = SHADING) -> Step:
     targets = StepTargets(camera(), result.final, priors=priors)
-    return Step(result, targets, shading, torch.zeros(1, 3), 1.0)
+    return Step(result, targets, shading, {}, 1.0)
 
 
 def native(weights: Weights, shading: ShadingModel = SHADING):

@@ -56,6 +56,7 @@ SERVER = Path(__file__).with_name("served_commands.py")
 STEPS = 120  # after so many the relief has a surface, of which a mesh can be made
 SHORT = {
     "demo": ["--steps", "12"],
+    "run": ["--steps", str(STEPS), "--downscale", "2", "--no-view"],
     "calibrate": [],
     "prepare": [],
     "inspect": ["--steps", "50"],
@@ -105,6 +106,15 @@ def single_shots(folder: Path) -> None:
         shutil.copy(shots / str(ANGLES[number % 4]) / f"{name}.png", folder / f"{name}.png")
 
 
+def numbered_shots(folder: Path) -> None:
+    """Four pictures of each view of the relief in a row, with running numbers as names."""
+    shots = folder.with_name("shots-of-numbered")
+    folder.mkdir()
+    for number, name in enumerate(write_relief(shots)):
+        for turn, angle in enumerate(ANGLES):
+            shutil.copy(shots / str(angle) / f"{name}.png", folder / f"IMG_{4 * number + turn:04d}.png")
+
+
 def photographs(folder: Path) -> None:
     """Pictures of the relief in color, without a filter."""
     shots = folder.with_name("shots-of-photographs")
@@ -139,6 +149,7 @@ def misnamed(folder: Path) -> None:
 
 INPUTS: dict[str, dict[str, Callable[[Path], object]]] = {
     "calibrate": {"SHOTS": polarizer_shots},
+    "run": {"RAW": raw_mosaics, "SHOTS": write_relief, "NUMBERED": numbered_shots},
     "prepare": {"RAW": raw_mosaics, "SHOTS": write_relief, "PHOTOS": photographs},
     "prepare --angles": {"SHOTS": single_shots},
     "inspect --fix": {"SCENE": misnamed},

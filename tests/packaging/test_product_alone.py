@@ -127,7 +127,7 @@ def test_names_and_help_do_without_the_neighbors(product: Product) -> None:
         "import polarguide\n"
         "try:\n    polarguide.compare\n"
         "except polarguide.PolarguideError as error:\n    print(error)\n"
-        "print(polarguide.recipe_names()[-1])"
+        "print([*polarguide.recipes()][-1])"
     )
     done = product.python(code)
     assert done.stdout.splitlines()[0].startswith("compare: expected the package polarguide_bench"), (

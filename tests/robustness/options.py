@@ -23,7 +23,7 @@ VERBS = (
      "recipe device transfer"),
     (EVAL, "threads", "", "device"),
     ("render run --out new", "frames", "rotate-environment", "views layers path environment"),
-    ("export run --out new", "resolution", "", "format"),
+    ("export run --out new", "resolution", "", "format layout picture"),
     ("priors scene --out new", "downscale", "refractive-index threshold", "views"),
     (MOSAICS, "bits saturation offset-x seed", "black-level zero",
      "order white-balance sensor calibration dark-frame masks poses intrinsics"),

@@ -105,6 +105,7 @@ CASES += table(
     Case("scores of a run", link("run/metrics.json", OUTSIDE), EVAL),
     Case("page of a run", link("run/share.html", OUTSIDE), f"share run {ONE}", ci=True),
     Case("folder of cameras in exports", link("new/sparse"), export("cameras")),
+    Case("folder of normal maps in exports", link("new/brush/normals", AWAY), export("normals"), ci=True),
     Case("lock of a new run", link("new/.lock", OUTSIDE), TRAIN),
     Case("pictures of an unfinished scene", link("unfinished/polar"), UNFINISHED, ci=True),
     Case("database of an unfinished scene", link(DATABASE, f"{AWAY}/made.db"), posed("sfm", UNFINISHED)),

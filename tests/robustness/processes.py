@@ -43,7 +43,7 @@ def _whole(most: int) -> Callable[[], None]:
 
 WRITERS = {
     "train": TRAIN, "resume": RESUME, "eval": EVAL, "share": SHARE, "render": RENDER, "prepare": MOSAICS,
-    **{f"export {kind}": export(kind) for kind in ("ply", "spz", "sog", "environment", "cameras")},
+    **{f"export {kind}": export(kind) for kind in ("ply", "spz", "sog", "environment", "cameras", "normals")},
 }  # fmt: skip
 CASES += [
     Case(f"files of at most {most} bytes, {name}", limit(resource.RLIMIT_FSIZE, most), command, check=_whole(most),
@@ -57,7 +57,6 @@ def _environment(**changed: str) -> None:
     os.environ.update(changed)
 
 
-TWO = {"WORLD_SIZE": "2", "RANK": "0", "LOCAL_RANK": "0", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": "29500"}
 CASES += table(
     "environment with", TRAIN,
     Case("a billion threads", _environment(POLARGUIDE_THREADS="1000000000"), READ, ci=True),
@@ -65,13 +64,6 @@ CASES += table(
     Case("a width below 0 for OpenCV", _environment(OPENCV_IO_MAX_IMAGE_WIDTH="-1"), READ, ci=True),
     Case("a unit for OpenCV", _environment(OPENCV_IO_MAX_IMAGE_PIXELS="64MB"), READ, passes=SAME, ci=True),
     Case("no folder for what is temporary", _environment(TMPDIR="/nowhere"), export("spz"), passes=WORKS),
-    *(Case(name, _environment(**{**TWO, **changed}), ci=True) for name, changed in (
-        ("no place to meet", {"MASTER_ADDR": ""}),
-        ("no port", {"MASTER_PORT": ""}),
-        ("a local rank in words", {"LOCAL_RANK": "x"}),
-        ("ranks in words", {"RANK": "first", "WORLD_SIZE": "many"}),
-        ("a world of 10^9", {"WORLD_SIZE": "1000000000", "MASTER_PORT": "0"}),
-    )),
 )  # fmt: skip
 
 PRESENTED = "run/presentation.json"

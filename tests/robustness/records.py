@@ -31,7 +31,7 @@ CASES += table(
         ("with a title of two lines", {"title": "a\nend_header"}, export("ply"), True),
         ("with a word too many", {"titel": "x"}, SHARE, True),
         ("of a meter of 1e-300", {"meters_per_unit": 1e-300}, export("ply"), True),
-        ("of a box turned inside out", {"crop": BOX}, export("points"), True),
+        ("of a box turned inside out", {"crop": BOX}, export("ply"), True),
         ("of a box with nothing in it, as a mesh", AWAY, export("mesh"), True),
         ("of a box with nothing in it, shared", AWAY, SHARE, False),
     )),

@@ -23,6 +23,7 @@ from polarguide.core.progress import SILENT
 from polarguide.geometry.camera import Camera
 from polarguide.raster import choose_backend
 from polarguide.recipes import RECIPES
+from polarguide.runs.folder import RunLog
 from polarguide.runs.health import (
     HEALTH,
     Health,
@@ -33,6 +34,7 @@ from polarguide.runs.health import (
     warnings_of,
 )
 from polarguide.runs.model import GaussianModel
+from polarguide.runs.train import train_gaussians
 from polarguide.shading.result import RenderResult
 from polarguide.training.angles.polarizers import Polarizers
 from polarguide.training.settings import TrainSettings
@@ -289,3 +291,17 @@ def test_a_training_writes_its_health_and_the_page_shows_it(demo_scene: Path, tm
     Fault("health.json").raised_by(getattr, run, "health")
     (run.folder / HEALTH).unlink()
     assert run.polarization == "not recorded"
+
+
+def test_held_out_scores_are_logged_and_change_no_training(
+    tiny_scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A short training scores no held-out view. With more time it does, and ends with the same Gaussians."""
+    states = []
+    for share, logged in ((0.02, 0), (10.0, 2)):
+        monkeypatch.setattr("polarguide.runs.health.TIME_SHARE", share)
+        run = train_gaussians(tiny_scene, tmp_path / str(share), settings=TrainSettings(20))
+        scores = [row["held_out"] for row in RunLog(run.folder).rows() if row["held_out"] is not None]
+        assert len(scores) == logged
+        states.append(run.model.state.gaussians.snapshot())
+    assert all(torch.equal(states[0][name], tensor) for name, tensor in states[1].items())

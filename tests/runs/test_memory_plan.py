@@ -82,10 +82,10 @@ def test_what_is_not_specified_follows_from_the_size_or_is_that_of_the_run_to_re
     tiny_scene: Scene,
 ) -> None:
     asked = TrainSettings()
-    found = resolve(asked, tiny_scene, STOKES, processes=3)
+    found = resolve(asked, tiny_scene, STOKES)
     pixels = sum(view.camera.width * view.camera.height for view in tiny_scene.train_views)
     assert (found.steps, found.gaussians) == (STEPS, int(pixels / STOKES.densification.pixels_each))
-    assert found.views_per_step == 3
+    assert found.views_per_step == 1
     assert found.background == "scene"
     given = TrainSettings(7, 1, 1.7, 2, "black", gaussians=9)
     assert vars(resolve(given, tiny_scene, STOKES, found)) == vars(given)

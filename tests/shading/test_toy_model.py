@@ -21,7 +21,6 @@ from polarguide.recipes import recipe_named
 from polarguide.results.evaluation.scores import score_view
 from polarguide.results.evaluation.target import ViewTarget
 from polarguide.results.export.adapters import ply_fields
-from polarguide.results.export.mesh import surface_points
 from polarguide.results.export.web_page import BAKED, share_page
 from polarguide.results.rendering.relight import needs_radiance
 from polarguide.runs.folder import load_checkpoint, save_checkpoint
@@ -117,12 +116,6 @@ def test_it_is_exported(trained: TrainingLoop, tmp_path: Path) -> None:
     assert set(read["extra"]) == {"linear_dc", "linear_rest"}
     # Display colors, reflections included: brighter than the base color alone.
     assert float((read["sh_dc"] - read["extra"]["linear_dc"]).mean()) > 0
-    gaussians, views = trained.state.gaussians, trained.context.scene.train_views
-    gaussians.overwrite("opacity_logits", gaussians["opacity_logits"] + 3)
-    points, normals, colors = surface_points(
-        gaussians, trained.current.shading, views, trained.context.backend.rasterize
-    )
-    assert len(points) == len(normals) == len(colors) > 0
     Fault("--format environment", "radiance").raised_by(
         needs_radiance, trained.current.shading, what="--format environment"
     )

@@ -94,7 +94,14 @@ def step(
     valid: Tensor | None = None,
     ssim_weight: float = 0.2,
 ) -> Step:
-    return Step(result, StepTargets(CAMERA, shown, valid, priors=priors), GLASS, SCALES, 2.0, ssim_weight)
+    return Step(
+        result,
+        StepTargets(CAMERA, shown, valid, priors=priors),
+        GLASS,
+        {"log_scales": SCALES},
+        2.0,
+        ssim_weight,
+    )
 
 
 def result(**layers: Tensor) -> RenderResult:

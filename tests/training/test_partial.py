@@ -77,7 +77,7 @@ def terms(result: RenderResult, view: View, weights: Weights = WEIGHTS) -> tuple
 
 def step(result: RenderResult, view: View) -> Step:
     partial = PartialView.of(view, CPU)
-    return Step(result, StepTargets(CAMERA, partial.shown, partial=partial), GLASS, torch.zeros(1, 3), 1.0)
+    return Step(result, StepTargets(CAMERA, partial.shown, partial=partial), GLASS, {}, 1.0)
 
 
 KINDS = {

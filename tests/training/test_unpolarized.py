@@ -12,7 +12,7 @@ from polarguide.recipes import RECIPES, recipe_named
 from polarguide_bench.recipes import ablations_of
 
 STEPS = 30
-CONTROLS = [r.name for base in RECIPES for r in ablations_of(base) if ":unpolarized" in r.name]
+CONTROLS = [r.name for base in (*RECIPES, "polgs") for r in ablations_of(base) if ":unpolarized" in r.name]
 
 
 def repolarized(view: View) -> View:
@@ -55,6 +55,7 @@ def test_every_recipe_of_ours_has_its_control() -> None:
         "polarguide:unpolarized-without-consistency",
         "polarguide-stokes:unpolarized",
         "polarguide-stokes:unpolarized-without-consistency",
+        "polgs:unpolarized",
     }
 
 

@@ -148,6 +148,13 @@ def _is_scene(folder: Path) -> bool:
     return False
 
 
+def is_posed_scene(folder: Path) -> bool:
+    """Return True if a folder is a scene with poses, which needs no preparation."""
+    with contextlib.suppress(PolarguideError, OSError):
+        return (folder / "sparse").is_dir() and bool(find_layout(folder))
+    return False
+
+
 def select_views(layout: CaptureFiles, views: Sequence[str] | None) -> list[str]:
     """Validate the requested view names and return them, sorted. By default, return the names of all views.
 

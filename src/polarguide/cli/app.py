@@ -40,6 +40,11 @@ VERBS = {
         "demo",
         "Train, evaluate and render the small scene that ships with the program.",
     ),
+    "run": Verb(
+        "polarguide.cli.run",
+        "run_folder",
+        "Go from a folder of pictures to a scene in a browser: prepare, inspect, train, eval and view.",
+    ),
     "calibrate": Verb(
         "polarguide_shots.verbs",
         "calibrate",
@@ -195,7 +200,7 @@ def run(arguments: Sequence[str]) -> int:
             )
     try:
         with warnings_printed():
-            status = _call(verb, arguments)
+            status = call(verb, arguments)
     except PolarguideError as error:
         return _failed(_as_flag(error, verb))
     except KeyboardInterrupt:
@@ -269,8 +274,13 @@ _SETTINGS = "Check the environment's variables for it (env), such as PYTORCH_JIT
 _MORE_ROOM = "Check this shell's limits (ulimit -a) and what else runs; --threads 1 takes less."
 
 
-def _call(verb: str | None, arguments: Sequence[str]) -> int:
-    """Call a verb and return its exit status, by default 0."""
+def call(verb: str | None, arguments: Sequence[str]) -> int:
+    """Call a verb and return its exit status, by default 0.
+
+    Args:
+        verb: name of the verb, or None if the command line begins with another word.
+        arguments: words of the command line after the program's name.
+    """
     if list(arguments) == ["--version"]:
         print(f"polarguide {polarguide.__version__}", flush=True)
         return 0

@@ -75,13 +75,6 @@ def inspect_capture(
         fix: New folder for a corrected copy of the scene, written if the order, the direction or the zero is wrong
             and the correction is certain.
     """
-    if fix is not None and settings.calibration is not None:
-        raise PolarguideError(
-            "--fix",
-            expected="no --calibration, which the corrected copy would lack",
-            found="both options",
-            remedy="Prepare the mosaics again with --calibration, and fix that scene.",
-        )
     set_threads(compute.threads)
     reporter = ConsoleReporter()
     inspection = importlib.import_module("polarguide.inspection.inspect")
@@ -173,7 +166,7 @@ def present_folder(
 
     The settings are in presentation.json in the folder. A scene's settings apply to all its runs; a run's own
     settings take precedence. Omitted options keep their values, "none" removes a value, and without options
-    the settings are printed. `polarguide view RUN` sets the same with the mouse. VIEW,X,Y is a pixel of a
+    the settings are printed. `polarguide view RUN` sets crop box and exposure with the mouse. VIEW,X,Y is a pixel of a
     photograph, from its top left corner.
 
     Args:

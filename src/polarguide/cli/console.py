@@ -20,11 +20,9 @@ import polarguide
 from polarguide.core.errors import PolarguideWarning
 from polarguide.core.options import ComputeOptions, ThreadOptions
 from polarguide.core.progress import Advance, Reporter
-from polarguide.core.system import process_rank
 from polarguide.core.text import printable
 
-# Only the first of several processes of a training prints.
-console = Console(highlight=False, soft_wrap=True, quiet=process_rank() > 0)
+console = Console(highlight=False, soft_wrap=True)
 
 
 # Texts from files and the command line may have megabytes, which would hide the error.

@@ -20,6 +20,7 @@ from polarguide.core.options import (
     ComputeOptions,
     ExportFormat,
     ModelOptions,
+    NormalOptions,
     PictureFormat,
     PlyFields,
     SceneOptions,
@@ -47,9 +48,7 @@ def train_scene(
 ) -> None:
     """Train a recipe on a scene.
 
-    Ctrl-C stops the training and saves its state; --resume continues to the same result. Several processes share the
-    views
-    of each step: torchrun --nproc-per-node N --no-python polarguide train ...
+    Ctrl-C stops the training and saves its state; --resume continues to the same result.
 
     Args:
         scene: Scene folder: polar/<view>_000|_045|_090|_135.png or four folders I-00 I-45 I-90 I-135, and a COLMAP
@@ -76,7 +75,7 @@ def train_scene(
             )
         except KeyboardInterrupt as stopped:
             if str(stopped):  # a requested stop; the text names the last step
-                say(f"{stopped}; go on with the same command and --resume")
+                say(f"{stopped}; the same train command and --resume continue")
             raise
     say(f"trained: {out}   next: {command('eval', out)}   {command('view', out)}")
 
@@ -143,15 +142,18 @@ def _errors(record: dict[str, Any], columns: list[Any]) -> Table:
     table.add_column("pixels", justify="right", no_wrap=True)
     for metric in columns:
         table.add_column(metric.heading, justify="right", min_width=8)
-    has_metals = any(errors.get("metal_share") is not None for errors in record["objects"].values())
-    if has_metals:
-        table.add_column("metal", justify="right", no_wrap=True)
+    headings = {"metal_share": "metal", "undecided_share": "undecided"}
+    shares = [
+        key for key in headings if any(errors.get(key) is not None for errors in record["objects"].values())
+    ]
+    for key in shares:
+        table.add_column(headings[key], justify="right", no_wrap=True)
 
     def add(name: str, errors: dict[str, Any]) -> None:
         values = [errors[metric.key] for metric in columns]
         texts = ["n/a" if v is None else f"{v:.{m.digits}f}" for m, v in zip(columns, values, strict=True)]
-        share = errors.get("metal_share")
-        texts += ["n/a" if share is None else f"{100 * share:.1f} %"] if has_metals else []
+        values = [errors.get(key) for key in shares]
+        texts += ["n/a" if share is None else f"{100 * share:.1f} %" for share in values]
         table.add_row(Text(printable(name)), f"{errors['pixels']:,}", *texts)
 
     largest = sorted(record["objects"], key=lambda name: -record["objects"][name]["pixels"])[:_MOST_OBJECTS]
@@ -380,19 +382,21 @@ def export_run(
     fields: PlyFields = "release",
     axes: Axes = "upright",
     model: Annotated[ModelOptions, tyro.conf.arg(name="")] = ModelOptions(),
+    normals: Annotated[NormalOptions, tyro.conf.arg(name="")] = NormalOptions(),
     machine: ThreadOptions = ThreadOptions(),
 ) -> None:
     """Export a run to the file formats of other programs.
 
     Splats (ply, spz, sog, splat-glb, splat-usdz) have reflections baked into harmonics. The mesh (GLB and PLY) is fused
-    from rendered depth and has diffuse colors and learned normals. The textured model (glb, obj, usdz) is for Blender,
-    game engines and viewers. Its base color has no highlights and no shading. Its closed surface (stl) is for 3D
-    printing. The points are opaque Gaussians with normals. The environment is the learned light as a panorama (EXR, HDR
-    and PNG). The cameras are a COLMAP model and transforms.json. The choice all is a package of most of these.
+    from rendered depth and has diffuse colors and learned normals. The textured model (glb, usdz) is for Blender, game
+    engines and viewers. Its base color has no highlights and no shading. Its closed surface (stl) is for 3D printing.
+    The environment is the learned light as a panorama (EXR, HDR and PNG). The cameras are a COLMAP model and
+    transforms.json. The normals are poses, pictures and normal maps for trainers with a normal loss. The choice all is
+    a package of most of these.
 
     Args:
         run: Run folder.
-        format: ply, spz, sog, splat-glb, splat-usdz, mesh, glb, obj, usdz, stl, points, environment, cameras or all.
+        format: ply, spz, sog, splat-glb, splat-usdz, mesh, glb, usdz, stl, environment, cameras, normals or all.
         out: Folder to write; default: RUN/export.
         resolution: Voxels of the mesh along its longest side.
         spz_version: Version of the SPZ file; programs support only one of the two.
@@ -411,6 +415,7 @@ def export_run(
         fields=fields,
         axes=axes,
         model=model,
+        normals=normals,
         reporter=reporter,
     ):
         size = f" ({size_text(path.stat().st_size)})" if path.is_file() else ""

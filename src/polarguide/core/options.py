@@ -31,22 +31,23 @@ ExportFormat = Literal[
     "splat-usdz",
     "mesh",
     "glb",
-    "obj",
     "usdz",
     "stl",
-    "points",
     "environment",
     "cameras",
+    "normals",
     "all",
 ]
 Axes = Literal["upright", "scene"]
 PlyFields = Literal["release", "all"]
+NormalLayout = Literal["brush", "dn-splatter"]
+TrainingPicture = Literal["photograph", "diffuse", "minimum"]
 BaseColor = Literal["delit", "diffuse", "photographs", "picture"]
 PictureFormat = Literal["png", "exr", "npy"]
 EXPORT_PACKAGES: dict[str, tuple[str, ...]] = {
     "spz": ("gaussforge",),
     "mesh": ("skimage",),
-    **dict.fromkeys(("glb", "obj"), ("skimage", "xatlas", "fast_simplification")),
+    "glb": ("skimage", "xatlas", "fast_simplification"),
     "all": ("gaussforge", "skimage", "xatlas", "fast_simplification"),
     "usdz": ("pxr", "skimage", "xatlas", "fast_simplification"),
     "splat-usdz": ("pxr",),
@@ -204,7 +205,7 @@ class SceneOptions:
 
 @dataclass(frozen=True)
 class ModelOptions:
-    """Options of a textured model (formats glb, obj and usdz) or of its surface (stl).
+    """Options of a textured model (formats glb and usdz) or of its surface (stl).
 
     Attributes:
         triangles: Approximate number of triangles of the simplified surface.
@@ -242,6 +243,24 @@ class ModelOptions:
     def resolved_base_color(self) -> BaseColor:
         """Kind of base color. The default depends on the option ``unlit``."""
         return self.base_color or ("picture" if self.unlit else "delit")
+
+
+@dataclass(frozen=True)
+class NormalOptions:
+    """Options of normal maps for other trainers (format normals).
+
+    Attributes:
+        layout: Program that reads the folder: brush or dn-splatter.
+        picture: photograph; diffuse: the rendered diffuse layer; minimum: the least light behind a polarizer at any
+            angle.
+    """
+
+    layout: NormalLayout = "brush"
+    picture: TrainingPicture = "photograph"
+
+    def __post_init__(self) -> None:
+        check_choice("layout", self.layout, get_args(NormalLayout))
+        check_choice("picture", self.picture, get_args(TrainingPicture))
 
 
 @dataclass(frozen=True)

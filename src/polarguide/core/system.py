@@ -22,8 +22,6 @@ from polarguide.core.errors import PolarguideError
 from polarguide.core.options import MOST_THREADS
 
 MEBIBYTE = 1 << 20
-LAST_WORDS_SECONDS = 5.0
-MOST_PROCESSES = 65536
 # Options of ``mallopt`` in glibc's malloc.h
 M_TRIM_THRESHOLD = -1
 M_MMAP_THRESHOLD = -3
@@ -101,11 +99,6 @@ class StopSignals:
             if self._stopping and number == signal.SIGINT:
                 interrupt(number, frame)
             self._stopping = True
-        elif number == signal.SIGTERM and process_count() > 1:
-            # torchrun ends all processes when one of them fails. Give the failed process time to print its message.
-            timer = threading.Timer(LAST_WORDS_SECONDS, os._exit, (128 + number,))
-            timer.daemon = True
-            timer.start()
         else:
             interrupt(number, frame)
 
@@ -288,58 +281,6 @@ def process_is_alive(pid: int) -> bool:
         return False
     except psutil.AccessDenied:
         return True
-
-
-def process_rank() -> int:
-    """Return the rank of this process under torchrun; return 0 without torchrun or if the rank is invalid."""
-    text = os.environ.get("RANK", "")
-    return int(text) if _is_count(text) else 0
-
-
-def process_count() -> int:
-    """Return the number of processes that torchrun started for this training; return 1 without torchrun.
-
-    Raises:
-        PolarguideError: a variable of torchrun is invalid.
-    """
-    world_text = os.environ.get("WORLD_SIZE", "1")
-    rank_text = os.environ.get("RANK", "0")
-    for name, text in (("WORLD_SIZE", world_text), ("RANK", rank_text)):
-        _require_variable(name, _is_count(text), f"a whole number up to {MOST_PROCESSES}", repr(text))
-    world = max(1, int(world_text))
-    rank = int(rank_text)
-    _require_variable(
-        "RANK",
-        rank < world <= MOST_PROCESSES,
-        f"one of up to {MOST_PROCESSES} processes, counted from 0",
-        f"{rank} of {world}",
-    )
-    if world > 1:
-        local, host, port = (
-            os.environ.get(name, "") for name in ("LOCAL_RANK", "MASTER_ADDR", "MASTER_PORT")
-        )
-        _require_variable(
-            "LOCAL_RANK", _is_count(local), "the number of this process on its machine", repr(local)
-        )
-        _require_variable("MASTER_ADDR", bool(host), "the machine of the first process", "none")
-        right_port = _is_count(port) and 0 < int(port) < 65536
-        _require_variable("MASTER_PORT", right_port, "a port from 1 to 65535", repr(port))
-    return world
-
-
-def _require_variable(name: str, right: bool, expected: str, found: str) -> None:
-    """Raise PolarguideError unless a variable of torchrun is valid."""
-    if not right:
-        raise PolarguideError(
-            name,
-            expected=expected,
-            found=found[:100],
-            remedy="Unset WORLD_SIZE and RANK, or start the training with torchrun.",
-        )
-
-
-def _is_count(text: str) -> bool:
-    return text.isascii() and text.isdigit() and len(text) < 10
 
 
 _SIZE = re.compile(r"[0-9]{1,18}(KB|Kb|kb|MB|Mb|mb)?")

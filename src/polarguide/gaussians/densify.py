@@ -113,8 +113,7 @@ class DensityStatistics:
     """Gradient statistics of each Gaussian, from which the density control decides.
 
     The norms of the screen-space gradients are summed over the pictures in which the Gaussian was visible. With several
-    views per step, each slot of a step has its own sums. The sums are added in order only when the mean is computed.
-    The result therefore does not depend on the number of processes that share the views of a step.
+    views per step, each slot of a step has its own sums, which are added when the mean is computed.
 
     Args:
         count: number N of Gaussians.

@@ -1,42 +1,31 @@
-"""Correct a capture. Corrected angles are written as a new scene; a sensor calibration is applied in memory."""
+"""Correct the angles of a capture, and report the calibration of its sensor."""
 
 from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import numpy as np
-import pycolmap
-import torch
-from numpy.typing import NDArray
 
 from polarguide import __version__
-from polarguide.capture import box_filter
 from polarguide.capture.angle_evidence import swaps
-from polarguide.capture.calibration import UNIT_GAINS, Calibration, oriented
-from polarguide.capture.colmap.model import MODELS
-from polarguide.capture.colmap.poses import undistortion
+from polarguide.capture.calibration import Calibration, oriented
 from polarguide.capture.formats.pictures import SUFFIXES
 from polarguide.capture.layout import describe_contents, index_files
 from polarguide.capture.presentation import PRESENTATION_FILE
-from polarguide.capture.sensor.analyzers import AnalyzerCalibration, read_analyzers
-from polarguide.capture.sensor.pattern import MosaicOptions
 from polarguide.capture.view import ANGLES, FULL_CODE
 from polarguide.capture.view_reader import read_view
 from polarguide.capture.write import intensity_codes, rounded_radiance, write_view
 from polarguide.core.errors import PolarguideError
 from polarguide.core.files import read_file, temporary_folder, write_whole
 from polarguide.core.progress import SILENT, Reporter
-from polarguide.core.records import decode, read_record, shortened, to_json
+from polarguide.core.records import decode, read_record, to_json
 from polarguide.inspection.angles import AngleFindings
-from polarguide.inspection.capture import Capture, InspectedView
+from polarguide.inspection.capture import Capture
 from polarguide.inspection.settings import Check
-from polarguide.preparation.journal import FourFactors, State, ViewRecord
 
 _COPIED = ("sparse", "masks", "invalid", "gt", "split.json", PRESENTATION_FILE)
 """Names of files and folders that are copied without changes."""
@@ -172,163 +161,19 @@ def _corrected_metadata(capture: Capture, change: Calibration) -> bytes:
     return to_json(content)
 
 
-STEPS = (1, 2, 4)
-"""Allowed numbers of sensor pixels per pixel of a picture, along each axis, in scenes of ``prepare``."""
-_REMEDY = "Prepare the mosaics with it: polarguide prepare RAW --out SCENE --calibration FILE."
-
-
 class _SceneNotes(msgspec.Struct):
-    """Fields of ``scene.json`` that the correction needs. ``sensor`` is an object in scenes of ``synth``."""
+    """Fields of ``scene.json`` that the inspection reports."""
 
-    sensor: str | dict[str, Any] | None = None
-    gains: FourFactors | None = None
     analyzers: dict[str, str] | None = None
-    prepare: State[Any] | None = None
 
 
-def corrected(capture: Capture, path: Path) -> Capture:
-    """Correct the pictures of a capture with the calibration of its sensor.
-
-    The correction matrices undergo the same steps as the pictures in ``prepare``: its region, gains, order of the
-    angles, and removal of lens distortion. They are then averaged like the pictures.
-
-    Args:
-        capture: a scene with mosaics of one sensor, or with four pictures per view at the full, half or quarter size of
-            the sensor.
-        path: a file of ``polarguide calibrate``.
-
-    Raises:
-        PolarguideError: the file is invalid, belongs to another sensor or size, or has been applied already.
-    """
-    calibration = read_analyzers(path)
-    notes = _notes(capture)
-    if notes.analyzers is not None:
-        raise PolarguideError(
-            capture.root,
-            expected="a scene that was prepared without --calibration",
-            found=_calibration_name(notes.analyzers),
-            remedy="Omit --calibration.",
-        )
-    if isinstance(notes.sensor, dict) or (notes.prepare is not None and notes.sensor is None):
-        raise PolarguideError(
-            capture.root,
-            expected="a scene of the mosaics of a sensor",
-            found="a scene of shots through a filter, of a dataset, or rendered",
-            remedy="Omit --calibration.",
-        )
-    calibration.require_sensor(notes.sensor, path)
-    applied = capture.applied
-    rotated = notes.prepare is not None if applied is None else not applied.permutes
-    if rotated:
-        raise PolarguideError(
-            capture.root,
-            expected="a scene whose angles differ from those of its sensor by multiples of 45 degrees",
-            found="a scene with another zero of its angles",
-            remedy=_REMEDY,
-        )
-    cache: dict[bytes, NDArray[np.float32]] = {}
-    views = []
-    for view in capture.views:
-        prepared = None if notes.prepare is None else notes.prepare.views.get(view.name)
-        key = b"" if prepared is None else msgspec.json.encode((prepared.geometry, prepared.warp))
-        if key not in cache:
-            matrices = _by_true_angle(
-                _matrices(calibration, notes, prepared, capture, view.name), applied, notes.gains
-            )
-            boxes = box_filter.mean(np.moveaxis(matrices, (2, 3), (0, 1)), capture.factor)
-            cache[key] = np.moveaxis(boxes, (0, 1), (2, 3))
-            if cache[key].shape[2:4] != view.codes.shape[1:3]:
-                raise _record_fault(capture, view.name, "a size that differs from its pictures")
-        views.append(_corrected_view(view, cache[key]))
-    return replace(capture, views=tuple(views))
-
-
-def _record_fault(capture: Capture, view: str, found: str) -> PolarguideError:
-    return PolarguideError(
-        f"{capture.root / METADATA} (prepare.views.{view})",
-        expected="the record that prepare wrote",
-        found=found,
-        remedy="Prepare the scene again.",
-    )
-
-
-def _calibration_name(record: Mapping[str, str]) -> str:
-    """Return the name of a calibration, for messages. ``record`` is its record in ``scene.json``."""
-    lens = f" and {record['lens']}" if record.get("lens") else ""
-    return f"the calibration of {record.get('sensor', '')}{lens} ({record.get('sha256', '')[:16]})"
-
-
-def analyzer_check(capture: Capture, path: Path | None) -> Check | None:
-    """Report the calibration of the sensor that was applied. Return None if there is no calibration."""
-    if path is not None:
-        record = read_analyzers(path).record()
-        finding = f"Corrected for this inspection with {_calibration_name(record)}."
-        remedy = "The scene itself is unchanged: prepare its mosaics with --calibration."
-        return Check("analyzers", "ok", finding, remedy, figures=record)
-    analyzers = _notes(capture).analyzers
-    if analyzers is None:
-        return None
-    finding = f"Prepared with {_calibration_name(analyzers)}."
-    return Check("analyzers", "ok", finding, figures=analyzers)
-
-
-def _notes(capture: Capture) -> _SceneNotes:
+def analyzer_check(capture: Capture) -> Check | None:
+    """Report the calibration of the sensor that ``prepare`` applied. Return None if there is no calibration."""
     path = capture.root / METADATA
     data = read_file(path) if path.exists() else b"{}"
-    return decode(data, _SceneNotes, path, remedy="Prepare the scene again.")
-
-
-def _matrices(
-    calibration: AnalyzerCalibration,
-    notes: _SceneNotes,
-    prepared: ViewRecord | None,
-    capture: Capture,
-    view: str,
-) -> NDArray[np.float32]:
-    """Return correction matrices for the pixels of a view, [4, 4, h, w] or [4, 4, h, w, 3].
-
-    Raises:
-        PolarguideError: the geometry or the camera in the scene does not fit a scene of ``prepare``.
-    """
-    if prepared is None or notes.prepare is None:
-        return calibration.of_pictures(capture.size[::-1])
-    options = decode(notes.prepare.request.settings, MosaicOptions, capture.root / METADATA)
-    geometry = prepared.geometry
-    if geometry.step not in STEPS:
-        raise _record_fault(capture, view, f"a step of {geometry.step}")
-    matrices = calibration.of_pictures(
-        geometry.size[::-1], offset=(options.offset_x, options.offset_y), scale=geometry.step
-    )
-    if prepared.warp is None:
-        return matrices
-    model = prepared.warp.model
-    parameters = prepared.warp.parameters
-    if model not in MODELS or len(parameters) != MODELS[model][1]:
-        raise _record_fault(capture, view, f"a camera {shortened(model)} with {len(parameters)} parameters")
-    width, height = geometry.size
-    camera = pycolmap.Camera(model=model, width=width, height=height, params=parameters)
-    planes = matrices.reshape(16, *matrices.shape[2:])
-    moved, _ = undistortion(camera).apply(planes, np.zeros((height, width), bool))
-    return moved.reshape(4, 4, *moved.shape[1:])
-
-
-def _by_true_angle(
-    matrices: NDArray[np.float32], applied: Calibration | None, gains: tuple[float, ...] | None
-) -> NDArray[np.float32]:
-    """Return correction matrices for pictures that were divided by gains and then named by their true angles."""
-    scaled = matrices * np.asarray(gains or UNIT_GAINS, np.float32).reshape(1, 4, *[1] * (matrices.ndim - 2))
-    if applied is None:
-        return scaled
-    source = [int(row.argmax()) for row in oriented(np.eye(4, dtype=np.float32), applied)]
-    return scaled[source][:, source]
-
-
-def _corrected_view(view: InspectedView, matrices: NDArray[np.float32]) -> InspectedView:
-    stored = view.codes.numpy().astype(np.float32)
-    weights = matrices if matrices.ndim == 5 else matrices[..., None]
-    values = np.stack([sum(weights[k, j] * stored[j] for j in range(4)) for k in range(4)])
-    if view.codes.dtype == torch.float32:
-        return replace(view, codes=torch.from_numpy(np.maximum(values, 0)))
-    saturated = view.saturated | torch.from_numpy((values > FULL_CODE).any(axis=(0, 3)))
-    codes = np.rint(np.clip(values, 0, FULL_CODE)).astype(np.uint16)
-    return replace(view, codes=torch.from_numpy(codes), saturated=saturated)
+    analyzers = decode(data, _SceneNotes, path, remedy="Prepare the scene again.").analyzers
+    if analyzers is None:
+        return None
+    lens = f" and {analyzers['lens']}" if analyzers.get("lens") else ""
+    name = f"the calibration of {analyzers.get('sensor', '')}{lens} ({analyzers.get('sha256', '')[:16]})"
+    return Check("analyzers", "ok", f"Prepared with {name}.", figures=analyzers)

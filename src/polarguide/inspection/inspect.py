@@ -30,7 +30,7 @@ from polarguide.geometry.scene_frame import scene_frame
 from polarguide.geometry.vectors import unit_array
 from polarguide.inspection.angles import AngleFindings, angle_checks, combine_evidence
 from polarguide.inspection.capture import Capture, InspectedView, ViewMeasurements, measure_view, read_capture
-from polarguide.inspection.corrections import analyzer_check, corrected
+from polarguide.inspection.corrections import analyzer_check
 from polarguide.inspection.evidence import (
     LONGEST,
     SurfaceSamples,
@@ -319,15 +319,6 @@ def inspect_scene(
     """
     check_options(settings)
     capture = read_capture(path, downscale=settings.downscale, transfer=settings.transfer, reporter=reporter)
-    if settings.calibration is not None and not capture.four:
-        raise PolarguideError(
-            "--calibration",
-            expected="a scene with four pictures of each view",
-            found="a scene with pictures at other angles",
-            remedy="Omit --calibration.",
-        )
-    if settings.calibration is not None:
-        capture = corrected(capture, settings.calibration)
     index = index_of(settings.refractive_index, capture.refractive_index)
     measurements: list[ViewMeasurements] = []
     with reporter.track("measuring", len(capture.views)) as advance:
@@ -339,7 +330,7 @@ def inspect_scene(
         return Inspection(capture, settings, index, tuple(measurements), tuple(checks), shots)
     pairing = find_pairing(capture)
     checks = picture_checks(capture, measurements, pairing)
-    calibrated = analyzer_check(capture, settings.calibration)
+    calibrated = analyzer_check(capture)
     checks += [] if calibrated is None else [calibrated]
     checks.append(view_exposure_check(capture))
     with reporter.track("matching features", 1):

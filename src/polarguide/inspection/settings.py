@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from msgspec import Meta
@@ -27,7 +26,6 @@ class InspectSettings:
         downscale: Width of pixel blocks that are averaged first. 0 averages until pictures are at most 640 pixels wide
             and high.
         transfer: Encoding of radiance in the files.
-        calibration: File of polarguide calibrate, with which the inspection corrects the scene.
     """
 
     normals: Normals = "auto"
@@ -35,7 +33,6 @@ class InspectSettings:
     refractive_index: Annotated[float, Meta(gt=1, lt=4)] | None = None
     downscale: Annotated[int, Meta(ge=0)] = 0
     transfer: Transfer = "linear"
-    calibration: Path | None = None
 
 
 Verdict = Literal["ok", "warning", "wrong", "n/a", "not verified"]

@@ -297,6 +297,11 @@ class FilterSource(ShotsSource):
         views = {view: [files[angle] for angle in ANGLES] for view, files in sorted(shots.items())}
         super().__init__(all_exposures([path for files in views.values() for path in files]), views, settings)
 
+    @property
+    def description(self) -> str:
+        """Number of views and of shots."""
+        return f"{len(self.views)} views, each with shots at 0, 45, 90 and 135 degrees ({len(self._shots)} pictures)"
+
     def measure(self, advance: Advance) -> ShotsMeasured:
         """Measure the levels, the transfer function and the exposures of the capture."""
         self._require_memory("four shots")
@@ -385,6 +390,18 @@ class SinglesSource(ShotsSource):
             self._singles.setdefault(shot.view, []).append(shot)
         files = {view: [shot.path for shot in group] for view, group in sorted(self._singles.items())}
         super().__init__([*all_exposures([*itertools.chain(*files.values())]), *tables], files, settings)
+
+    @property
+    def description(self) -> str:
+        """Number of photographs and their angles."""
+        angles = {shot.angle for shots in self._singles.values() for shot in shots}
+        if angles == {"none"}:
+            return f"{len(self._shots)} photographs without a polarizing filter"
+        texts = sorted(map(angle_text, angles), key=lambda text: (len(text), text))
+        return (
+            f"{len(self.views)} views, {len(self._shots)} photographs through a polarizing filter "
+            f"(angles: {listed(texts)})"
+        )
 
     def measure(self, advance: Advance) -> ShotsMeasured:
         """Measure the levels and the transfer function of the capture, and read the exposures that files state.

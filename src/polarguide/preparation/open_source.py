@@ -6,6 +6,7 @@ Poses refer to the pictures as stored, or to the pictures after rotation by EXIF
 from __future__ import annotations
 
 import shlex
+import warnings
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -31,7 +32,7 @@ from polarguide.capture.pose_files import TEST, parts_of_poses, read_parts
 from polarguide.capture.sensor.pattern import SENSOR_NAMES
 from polarguide.capture.sensor.raw_file import RAW_SUFFIXES
 from polarguide.capture.view import ANGLES, listed
-from polarguide.core.errors import PolarguideError
+from polarguide.core.errors import PolarguideError, PolarguideWarning
 from polarguide.core.files import require_folder
 from polarguide.core.progress import Reporter
 from polarguide.core.text import command, stem_of
@@ -221,6 +222,27 @@ def _is_gray(path: Path) -> bool:
     return bool((pixels[..., 0] == pixels[..., 1]).all())
 
 
+def describe_source(root: Path, settings: PrepareSettings) -> str:
+    """Return a description of the capture in a folder, as ``prepare_scene`` recognizes it. Nothing is written.
+
+    Raises:
+        PolarguideError: the folder does not exist, or contains no readable picture.
+    """
+    if _is_video(root):
+        return f"the video {listed([video.name for video in find_videos(root)])}"
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", PolarguideWarning)  # the preparation repeats them
+        return open_source(root, settings.checked()).description
+
+
+def _is_video(root: Path) -> bool:
+    """Return True if a path is a video, or a folder of videos without pictures and folders."""
+    pictures = SHOT_SUFFIXES + RAW_SUFFIXES
+    return bool(find_videos(root)) and not (
+        root.is_dir() and any(path.is_dir() or path.suffix.lower() in pictures for path in root.iterdir())
+    )
+
+
 def frames_of_video(
     root: Path, out: Path, settings: PrepareSettings, reporter: Reporter
 ) -> tuple[Path, PrepareSettings]:
@@ -236,8 +258,7 @@ def frames_of_video(
     if not videos:
         return root, settings
     names = listed([video.name for video in videos])
-    if root.is_dir() and any(path.is_dir() or path.suffix.lower() in SHOT_SUFFIXES + RAW_SUFFIXES
-                             for path in root.iterdir()):  # fmt: skip
+    if not _is_video(root):
         reporter.say(
             f"Not used: {names}. To prepare frames of a video, use polarguide prepare VIDEO --out SCENE."
         )

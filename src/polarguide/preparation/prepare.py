@@ -459,7 +459,7 @@ def prepare_scene(
     if folder.finished:
         reporter.say(f"{target} is already complete.")
         return _outcome(folder, pictures, settings, new=False)
-    reporter.say(f"{len(pictures.views)} views, format {pictures.kind}.")
+    reporter.say(f"{pictures.description}.")
     if poses is not None:
         for note in filter(None, (frames, *poses.notes)):
             reporter.say(note)

@@ -116,6 +116,11 @@ class Source(Protocol):
     paths: list[Path]
     masks: Mapping[str, Path] = MappingProxyType({})
 
+    @property
+    def description(self) -> str:
+        """Number of views and their kind, for the user."""
+        return f"{len(self.views)} views of the dataset {self.kind}"
+
     def measure(self, advance: Advance) -> Measured:
         """Measure the properties that all views of the capture share."""
 
@@ -441,6 +446,12 @@ class MosaicSource(Source):
                 found=settings.white_balance,
                 remedy="Remove the option.",
             )
+
+    @property
+    def description(self) -> str:
+        """Number of mosaics."""
+        mosaics = f"{len(self.views)} raw mosaics of a polarization camera"
+        return mosaics if self._dataset is None else f"{super().description}, {mosaics}"
 
     def stored(self, view: str) -> Stored:
         """Return the size of a view, from the header of its mosaic or from the settings."""

@@ -27,14 +27,11 @@ __all__ = [
 ]
 
 
-def choose_backend(
-    name: DeviceName, *, local_rank: int = 0, say: Callable[[str], None] = lambda _: None
-) -> Backend:
+def choose_backend(name: DeviceName, *, say: Callable[[str], None] = lambda _: None) -> Backend:
     """Choose the backend of a device. ``auto`` selects the GPU if the machine has one and gsplat is installed.
 
     Args:
         name: value of ``--device``.
-        local_rank: number of the GPU in the machine, for the processes of one training.
         say: receives messages for the user, such as the start of a compilation.
 
     Raises:
@@ -45,16 +42,15 @@ def choose_backend(
     if name == "auto" and not has_gsplat():
         say("the machine has a GPU, but the package gsplat is not installed: computing on the CPU")
         return Backend(torch.device("cpu"), rasterize_cpu)
-    count = torch.cuda.device_count() if torch.cuda.is_available() else 0
-    if local_rank >= count:
+    if not torch.cuda.is_available():
         built = torch.version.cuda or "none"
         raise PolarguideError(
             "--device cuda",
-            expected="a GPU for each process",
-            found=f"{count} that PyTorch {torch.__version__} can use (its CUDA: {built})",
-            remedy="Install PyTorch with CUDA and a matching driver, start fewer processes, or use --device cpu.",
+            expected="a GPU",
+            found=f"none that PyTorch {torch.__version__} can use (its CUDA: {built})",
+            remedy="Install PyTorch with CUDA and a matching driver, or use --device cpu.",
         )
-    device = torch.device("cuda", local_rank)
+    device = torch.device("cuda", 0)
     torch.cuda.set_device(device)
     load_gsplat(say)
     return Backend(device, rasterize_cuda)

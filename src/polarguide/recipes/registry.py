@@ -124,6 +124,10 @@ _BUILT_IN = {
 }
 
 
+REGISTERED: dict[str, Recipe] = {}
+"""Recipes of ``register_recipe``."""
+
+
 def recipe_named(name: str) -> Recipe:
     """Return a recipe or a variation by name. Ablations and plug-ins are loaded if the name is not built in.
 
@@ -143,6 +147,8 @@ def recipe_named(name: str) -> Recipe:
     ablations = _ablations()
     if name in ablations:
         return ablations[name]
+    if name in REGISTERED:
+        return REGISTERED[name]
     offers, failures = _plugins()
     offered = offers.get(name, {})
     if len(offered) == 1:
@@ -166,16 +172,45 @@ def recipe_named(name: str) -> Recipe:
     )
 
 
-def recipe_names() -> list[str]:
-    """Return the names of all recipes that ``train`` accepts.
+class RecipeTable(dict[str, Recipe]):
+    """Recipes by name, displayed as one line for each recipe."""
 
-    These are built-in recipes, controls, ablations, and recipes of plug-ins.
+    def __repr__(self) -> str:
+        """Return the name and the description of each recipe."""
+        width = max(map(len, self), default=0)
+        return "\n".join(f"{name:{width}}  {recipe.about}" for name, recipe in self.items())
+
+
+def recipes() -> RecipeTable:
+    """Return all recipes that ``train`` accepts, by name.
+
+    These are built-in recipes, controls, ablations, recipes of plug-ins, and registered recipes.
 
     Example:
-        >>> polarguide.recipe_names()[:2]    # doctest: +SKIP
-        ['3dgs', '3dgs-dr']
+        >>> mine = dataclasses.replace(polarguide.recipes()["3dgs"], name="mine", ssim_weight=0.3)    # doctest: +SKIP
     """
-    return [*dict.fromkeys((*_BUILT_IN, *_ablations(), *_plugins()[0]))]
+    plugins = {name: offered for name, offered in _plugins()[0].items() if len(offered) == 1}
+    names = dict.fromkeys((*_BUILT_IN, *_ablations(), *plugins, *REGISTERED))
+    return RecipeTable({name: recipe_named(name) for name in names})
+
+
+def register_recipe(recipe: Recipe) -> None:
+    """Make a recipe available by its name in this process. It replaces a registered recipe of the same name.
+
+    Raises:
+        PolarguideError: a value is invalid, or the name belongs to another recipe.
+    """
+    where = f"recipe {recipe.name}"
+    check_recipe(recipe, where)
+    taken = {**_BUILT_IN, **_ablations(), **_plugins()[0]}
+    require(
+        recipe.name not in taken,
+        where,
+        expected="a name that no other recipe has",
+        found="a recipe of this name with other values",
+        remedy="Rename it: dataclasses.replace(recipe, name=...).",
+    )
+    REGISTERED[recipe.name] = recipe
 
 
 def variations_offered(name: str) -> tuple[Recipe, ...]:

@@ -66,10 +66,14 @@ def in_words(seconds: float) -> str:
 
 LOG_EVERY = 10
 """Number of steps between two lines of the log."""
+CURVE_POINTS = 10
+"""Number of scores of held-out views in the log of a training."""
 SMOOTHING = 0.98
 """Weight of earlier steps in the displayed loss and PSNR."""
 Ends = Callable[[], bool]
 """Function that returns True to end the training."""
+HeldOutScore = Callable[[], float | None]
+"""Function that returns the mean PSNR of a few held-out views in dB; None if it examines no view."""
 Look = Callable[[Ends], None]
 """Function that runs between two steps, such as a viewer. Its argument returns True when the training should end."""
 
@@ -93,14 +97,19 @@ class Progress(Callback[Loop]):
 
     Args:
         advance: function that receives progress.
-        log: log of the run. None if this rank writes no log.
+        log: log of the run.
         stopwatch: stopwatch of the training.
+        held_out: function that scores held-out views, ``CURVE_POINTS`` times in a training. The scores go to the log;
+            no decision uses them.
     """
 
-    def __init__(self, advance: Advance, log: RunLog | None, stopwatch: Stopwatch) -> None:
+    def __init__(
+        self, advance: Advance, log: RunLog, stopwatch: Stopwatch, held_out: HeldOutScore = lambda: None
+    ) -> None:
         self._advance = advance
         self._log = log
         self._stopwatch = stopwatch
+        self._held_out = held_out
         self._smooth: Tensor | None = None
         self._began = stopwatch.read()[0]
         self._first = -1
@@ -109,15 +118,17 @@ class Progress(Callback[Loop]):
     def after_step(self, loop: Loop, report: StepReport) -> None:
         if self._first < 0:
             self._first = report.done - 1
-        elif report.step == 0 and self._log is not None:
+        elif report.step == 0:
             self._log.cut(0)  # the training has begun again
         self._waiting.append(report)
         if (report.step + 1) % LOG_EVERY:
             return
         loss, psnr = self.read()
-        if self._log is None:
-            return
         seconds, alone = self._stopwatch.read()
+        held_out = None
+        if report.done * CURVE_POINTS // loop.total > (report.done - LOG_EVERY) * CURVE_POINTS // loop.total:
+            with self._stopwatch.paused():
+                held_out = self._held_out()
         self._log.append(
             step=report.step,
             stage=report.stage,
@@ -126,6 +137,7 @@ class Progress(Callback[Loop]):
             gaussians=report.gaussians,
             seconds=round(seconds, 3),
             alone=alone,
+            **({} if held_out is None else {"held_out": round(held_out, 3)}),
         )
 
     def read(self) -> tuple[float, float]:
@@ -183,11 +195,9 @@ class Checkpoints(Callback[Loop]):
         self.save(loop)
 
     def save(self, loop: Loop) -> None:
-        """Save the state with the sums of all ranks. Every rank has to call it."""
-        state = loop.saved_state()
-        if loop.ranks.rank == 0:
-            unfinished = state.step < loop.settings.steps
-            save_checkpoint(self.out, state, optimizer=unfinished or self.session.keep_optimizer)
+        """Save the state."""
+        unfinished = loop.state.step < loop.settings.steps
+        save_checkpoint(self.out, loop.state, optimizer=unfinished or self.session.keep_optimizer)
 
 
 @dataclass(eq=False)
@@ -215,7 +225,7 @@ class MemoryLimit(Callback[Loop]):
 
 @dataclass(eq=False)
 class Stop(Callback[Loop]):
-    """Callback that ends the training on request, after the same step on all ranks."""
+    """Callback that ends the training on request."""
 
     should_stop: Ends
 
@@ -225,9 +235,7 @@ class Stop(Callback[Loop]):
     def check(self, loop: Loop) -> None:
         """Raise TrainingStopped if the training should end before its last step."""
         step = loop.state.step
-        # Ranks rarely exchange the request, because each exchange takes time.
-        due = step < loop.settings.steps and (loop.ranks.world == 1 or step % LOG_EVERY == 0)
-        if due and loop.ranks.any(self.should_stop()):
+        if step < loop.settings.steps and self.should_stop():
             raise TrainingStopped(step)
 
 
@@ -260,8 +268,9 @@ def run_to_the_end(
     should_stop: Ends,
     look: Look | None,
     planned: int,
+    held_out: HeldOutScore = lambda: None,
 ) -> None:
-    """Train to the end with progress, checkpoints and a log. Only rank 0 writes files.
+    """Train to the end with progress, checkpoints and a log.
 
     Args:
         loop: the loop. The callbacks of this module are inserted before its existing observers.
@@ -271,17 +280,17 @@ def run_to_the_end(
         should_stop: function that returns True to end the training.
         look: function that is called between steps, such as a viewer. None means that no function is called.
         planned: memory in bytes that the process may use.
+        held_out: function that scores held-out views for the log.
 
     Raises:
         TrainingStopped: ``should_stop`` returned True; the state is saved.
     """
-    log = RunLog(out) if loop.ranks.rank == 0 else None
-    if log is not None:
-        log.cut(loop.state.step)
-    stopwatch = Stopwatch(*(log.elapsed() if log else (0.0, True)))
+    log = RunLog(out)
+    log.cut(loop.state.step)
+    stopwatch = Stopwatch(*log.elapsed())
     stop = Stop(should_stop)
     with reporter.track("training", loop.total) as advance:
-        progress = Progress(advance, log, stopwatch)
+        progress = Progress(advance, log, stopwatch, held_out)
         checkpoints = Checkpoints(out, session, progress, stopwatch)
         viewing = [] if look is None else [Viewing(look, should_stop, stopwatch)]
         memory = MemoryLimit(MemoryBound(planned))
@@ -296,7 +305,7 @@ def run_to_the_end(
             checkpoints.save(loop)
             raise
         except KeyboardInterrupt:
-            if loop.ranks.world == 1 and loop.whole:
+            if loop.whole:
                 checkpoints.save(loop)
             raise
     for observer in loop.observers:

@@ -62,7 +62,7 @@ class RunConfiguration:
         device: device of the training.
         test_views: names of the held-out views.
         version: version of polarguide.
-        painted: hash of the painted materials of the training, see ``runs.painted``. None without painted materials.
+        painted: hash of materials that were painted in the viewer of an earlier version. None without them.
     """
 
     scene: Annotated[str, msgspec.Meta(min_length=1)]
@@ -85,7 +85,6 @@ class RunConfiguration:
         recipe_data: dict[str, Any],
         settings: ResolvedSettings,
         device: torch.device,
-        painted: str | None = None,
     ) -> RunConfiguration:
         """Return the record of a training."""
         return cls(
@@ -98,7 +97,6 @@ class RunConfiguration:
             transfer="srgb" if scene.transfer == "srgb" else "linear",
             device=str(device),
             test_views=scene.test_names,
-            painted=painted,
         )
 
     def save(self, run: Path) -> None:
@@ -312,6 +310,7 @@ class _Row(msgspec.Struct):
     seconds: Annotated[float, msgspec.Meta(ge=0)] = 0.0
     alone: bool = True
     psnr: float | None = None
+    held_out: float | None = None
 
 
 _ROWS = msgspec.json.Decoder(_Row)
@@ -357,8 +356,6 @@ def resolve(
     scene: Scene,
     method: Recipe,
     resumed: ResolvedSettings | None = None,
-    *,
-    processes: int = 1,
 ) -> ResolvedSettings:
     """Return the complete settings of a training.
 
@@ -366,7 +363,6 @@ def resolve(
         settings: settings that the user specified.
         scene, method: scene and recipe of the training.
         resumed: settings of the run to resume. They take precedence over defaults that depend on the scene.
-        processes: number of processes that share the views of a step.
 
     Raises:
         PolarguideError: a setting is out of range.
@@ -377,7 +373,7 @@ def resolve(
         **vars(settings),
         "steps": _steps(sizes),
         "refractive_index": index_of(None, scene.refractive_index),
-        "views_per_step": processes,
+        "views_per_step": 1,
         **recorded,
         "gaussians": most_gaussians(sum(sizes), method, settings, resumed),
         **settings.specified(),

@@ -34,6 +34,7 @@ from polarguide.core.records import read_record
 from polarguide.core.text import command
 from polarguide.gaussians.densify import Densification, free_space
 from polarguide.optics.color import srgb_encode
+from polarguide.runs.callbacks import CURVE_POINTS, HeldOutScore
 from polarguide.runs.folder import PLY
 from polarguide.runs.model import GaussianModel, write_run_ply
 from polarguide.training.angles.fits import AngleFits
@@ -123,6 +124,8 @@ MOST_VIEWS = 64
 """Largest number of examined views."""
 TIME_SHARE = 0.02
 """Largest number of examined views, as a share of the number of steps. Examining a view takes no longer than a step."""
+CURVE_VIEWS = 4
+"""Largest number of held-out views that are scored during a training."""
 NEIGHBORS = 6
 """Number of neighbors with which a view is compared. Smaller captures are not compared."""
 HIGHEST_PSNR = 100.0
@@ -345,9 +348,7 @@ def _examine_view(
     counted = _counted(local)
     stokes = model.stokes(result, camera) if filters else None
     measured, predicted = _compared(local, result.final, stokes)
-    errors = srgb_encode(predicted.nan_to_num(0.0, 1.0, 0.0).clamp(0, 1)) - srgb_encode(measured.clamp(0, 1))
-    error = errors[:, counted].square().mean().double()
-    psnr = None if bool(error.isnan()) else min(float(-10 * torch.log10(error)), HIGHEST_PSNR)
+    psnr = _psnr(predicted, measured, counted)
     burned = ~(result.final <= limit).all(dim=-1) & counted
     photograph = local.photograph().mean(dim=-1)
     light = result.final.mean(dim=-1)
@@ -360,6 +361,13 @@ def _examine_view(
         fog = float((model.alpha_in_front(camera, depth) * result.alpha).mean().clamp(0, 1))
     stops = _stops(measured.mean(dim=0), predicted.mean(dim=0), counted)
     return ViewHealth(psnr, None, _share(burned), fog, _share(bare), stops), result.training["radii"]
+
+
+def _psnr(predicted: Tensor, measured: Tensor, counted: Tensor) -> float | None:
+    """Return the PSNR of linear pictures [K, H, W, 3] in dB, as displayed; None if no pixel of ``counted`` is True."""
+    errors = srgb_encode(predicted.nan_to_num(0.0, 1.0, 0.0).clamp(0, 1)) - srgb_encode(measured.clamp(0, 1))
+    error = errors[:, counted].square().mean().double()
+    return None if bool(error.isnan()) else min(float(-10 * torch.log10(error)), HIGHEST_PSNR)
 
 
 def _stops(measured: Tensor, predicted: Tensor, counted: Tensor) -> tuple[float, float, float] | None:
@@ -501,6 +509,29 @@ def _worst(shares: Mapping[str, float], of: str = "of the pixels") -> str:
     """Return the names of views as text, ordered by decreasing share, with the share of the first view."""
     first, *rest = sorted(shares, key=lambda name: -shares[name])
     return listed([f"{first} ({100 * shares[first]:.1f} % {of})", *rest])
+
+
+def held_out_score(loop: TrainingLoop) -> HeldOutScore:
+    """Return a function that computes the mean PSNR of a few held-out views with the current Gaussians.
+
+    All calls in a training render at most ``TIME_SHARE`` of its number of steps. A short training scores no view.
+    """
+    context = loop.context
+    scored = min(CURVE_VIEWS, int(TIME_SHARE * context.settings.steps / CURVE_POINTS))
+    views = evenly(context.scene.test_views, scored) if scored else []
+
+    @torch.no_grad()
+    def score() -> float | None:
+        model = GaussianModel.of(loop.state, context.recipe, context.settings, context.backend)
+        scores = []
+        for view in context.memory.between(views):
+            local = view.to(model.device)
+            final = model.render(view.camera).final
+            scores.append(_psnr(final[None], local.photograph()[None], _counted(local)))
+        finite = [value for value in scores if value is not None]
+        return sum(finite) / len(finite) if finite else None
+
+    return score
 
 
 @dataclass(eq=False)

@@ -20,7 +20,7 @@ from polarguide.core.options import PathLike, SceneOptions, SessionOptions
 from polarguide.core.progress import SILENT, Reporter
 from polarguide.core.records import first_differing_value
 from polarguide.core.system import MemoryBound, return_freed_memory
-from polarguide.raster import Backend, use_threads
+from polarguide.raster import Backend, choose_backend, use_threads
 from polarguide.recipes import recipe_named
 from polarguide.runs.callbacks import Ends, Look, run_to_the_end
 from polarguide.runs.folder import (
@@ -30,20 +30,24 @@ from polarguide.runs.folder import (
     load_checkpoint,
     most_gaussians,
     resolve,
-    save_checkpoint,
     writing_to,
 )
-from polarguide.runs.health import HealthCheck, MetalReport, PlyFile, PolarizerReport, RecordedWarnings
+from polarguide.runs.health import (
+    HealthCheck,
+    MetalReport,
+    PlyFile,
+    PolarizerReport,
+    RecordedWarnings,
+    held_out_score,
+)
 from polarguide.runs.memory_plan import MemoryPlan, pixels_of, plan_memory
 from polarguide.runs.model import GaussianModel
 from polarguide.runs.opened import OpenedRun, read_scene, trained_scene
-from polarguide.runs.painted import FOLDER, read_painted
 from polarguide.training.angles.fits import gaussian_training
 from polarguide.training.callback import AnyCallback
 from polarguide.training.context import TrainingContext
-from polarguide.training.distributed import Ranks, backend_of, process_group
 from polarguide.training.loop import TrainingLoop
-from polarguide.training.metals.search import looks, warn_of_unused_materials
+from polarguide.training.metals.search import warn_of_unused_materials
 from polarguide.training.recipe import Recipe
 from polarguide.training.settings import ResolvedSettings, TrainSettings
 from polarguide.training.state import TrainingState
@@ -89,55 +93,42 @@ def train_gaussians(
     out = Path(out)
     use_threads(session.threads)
     method = recipe_named(recipe) if isinstance(recipe, str) else recipe
-    with process_group(session.device, out) as ranks, ExitStack() as stack:
-        leads = ranks.rank == 0
-        reporter = reporter if leads else SILENT
-        _check_out(out, resume, ranks)
-        backend = backend_of(ranks, session.device, reporter)
+    with ExitStack() as stack:
+        check_run_folder(out, resume)
+        backend = choose_backend(session.device, say=reporter.say)
         earlier = RunConfiguration.load(out).settings if resume else None
         plan = _planned(scene, method, settings, earlier, reading)
         original = scene if isinstance(scene, Scene) else read_scene(scene, reading, reporter, hold=plan.hold)
         loaded = trained_scene(original, settings)
         check_trainable(loaded)
-        resolved = resolve(settings, loaded, method, earlier, processes=ranks.world)
-        _report_settings(settings, resolved, loaded, ranks, reporter, resume=resume)
-        painted = read_painted(out, loaded) if resume else None
-        loaded = loaded if painted is None else painted.over(loaded)
-        digest = None if painted is None else painted.digest
-        configuration = RunConfiguration.of(
-            loaded, method.name, method.data(), resolved, backend.device, digest
-        )
+        resolved = resolve(settings, loaded, method, earlier)
+        _report_settings(settings, resolved, loaded, reporter, resume=resume)
+        configuration = RunConfiguration.of(loaded, method.name, method.data(), resolved, backend.device)
         state = None
         if resume:
-            if leads:
-                stack.enter_context(writing_to(out))
-            state = _resumed_state(out, method, configuration, reporter, leads=leads)
+            stack.enter_context(writing_to(out))
+            state = _resumed_state(out, method, configuration, reporter)
         return_freed_memory()  # of decoding
         store = stack.enter_context(closing(view_store(plan, backend, out, reporter)))
         bound = MemoryBound(plan.peak)
-        context = TrainingContext(loaded, method, resolved, backend, ranks, store, bound, reporter)
+        context = TrainingContext(loaded, method, resolved, backend, store, bound, reporter)
         warn_of_unused_materials(context)
         loop, fits = gaussian_training(context, state, callbacks)
         if fits.polarizers.ignored:
             reporter.warn(ignored_filters(method.name))
         with watch(loop) if watch is not None else nullcontext() as look:
-            ranks.barrier()
-            if leads:
-                if not resume:
-                    stack.enter_context(writing_to(out))
-                    if problem := unsuitable_folder(
-                        out, resume
-                    ):  # another training has begun in the meantime
-                        raise problem
-                configuration.save(out)
-                recorded = RecordedWarnings(reporter)
-                loop.observers += [
-                    PolarizerReport(out, fits, recorded),
-                    MetalReport(out, recorded),
-                    PlyFile(out),
-                    HealthCheck(out, fits, recorded),
-                ]
-            run_to_the_end(loop, out, session, reporter, should_stop, look, plan.peak)
+            if not resume:
+                stack.enter_context(writing_to(out))
+                check_run_folder(out, resume)  # another training may have begun in the meantime
+            configuration.save(out)
+            recorded = RecordedWarnings(reporter)
+            loop.observers += [
+                PolarizerReport(out, fits, recorded),
+                MetalReport(out, recorded),
+                PlyFile(out),
+                HealthCheck(out, fits, recorded),
+            ]
+            run_to_the_end(loop, out, session, reporter, should_stop, look, plan.peak, held_out_score(loop))
         model = GaussianModel.of(loop.state, method, resolved, backend)
     return OpenedRun(out, configuration, method, model, scene=original, reporter=reporter)
 
@@ -146,42 +137,28 @@ def _report_settings(
     settings: TrainSettings,
     resolved: ResolvedSettings,
     scene: Scene,
-    ranks: Ranks,
     reporter: Reporter,
     *,
     resume: bool,
 ) -> None:
-    """Report settings that depend on the scene, and warn about processes without a view."""
+    """Report settings that depend on the scene."""
     if settings.refractive_index is None and not resume and scene.refractive_index is not None:
         reporter.say(f"refractive index {scene.refractive_index:g} from scene.json")
-    idle = ranks.world - resolved.views_per_step
-    if idle > 0:
-        reporter.warn(f"{idle} of {ranks.world} processes have no view to render")
     if settings.background == "auto" and resolved.background == "black":
         reporter.say("the edges of the pictures are black: the training has no background behind the subject")
 
 
 def _resumed_state(
-    out: Path, recipe: Recipe, configuration: RunConfiguration, reporter: Reporter, *, leads: bool
+    out: Path, recipe: Recipe, configuration: RunConfiguration, reporter: Reporter
 ) -> TrainingState | None:
-    """Read the state to resume from. Return None if the run has no checkpoint.
-
-    If the painted materials have changed since the training, the state is set back to the last step that searches for
-    metals.
-    """
-    settings = configuration.settings
-    recorded = RunConfiguration.load(out)
-    check_same_run(recorded, configuration, out)
+    """Read the state to resume from. Return None if the run has no checkpoint."""
+    check_same_run(RunConfiguration.load(out), configuration, out)
     state = None
     if os.path.lexists(out / CHECKPOINT):  # a broken link is an error, not a missing file
         state = load_checkpoint(out, recipe, torch.device(configuration.device))
-        _check_state(state, settings, out)
+        _check_state(state, configuration.settings, out)
     else:
         reporter.say(f"{out} has no checkpoint: the training begins at step 0")
-    if recorded.painted != configuration.painted:
-        _go_back(state, recipe, settings, out, reporter)
-        if state is not None and leads:
-            save_checkpoint(out, state)  # before run.json records the painted materials
     return state
 
 
@@ -209,31 +186,22 @@ def view_store(plan: MemoryPlan, backend: Backend, out: Path, reporter: Reporter
     return ViewStore(plan.view_bytes, out, reporter.warn)
 
 
-def _check_out(out: Path, resume: bool, ranks: Ranks) -> None:
-    """Check the folder on rank 0 before it writes to it, and end all ranks if the folder is unsuitable."""
-    problem = unsuitable_folder(out, resume) if ranks.rank == 0 else None
-    if ranks.any(problem is not None):
-        raise problem or SystemExit(2)
+def check_run_folder(out: Path, resume: bool) -> None:
+    """Check a run folder. A new training needs a new folder, and resuming needs a folder with a run.
 
-
-def unsuitable_folder(out: Path, resume: bool) -> PolarguideError | None:
-    """Return the error for an unsuitable run folder, or None for a suitable folder.
-
-    A new training needs a new folder. Resuming needs a folder with a run.
+    Raises:
+        PolarguideError: the folder is unsuitable.
     """
-    try:
-        check_out(out)
-        refuse_scene(out)
-    except PolarguideError as error:
-        return error
+    check_out(out)
+    refuse_scene(out)
     if os.path.lexists(out / CONFIGURATION) == resume:
-        return None
+        return
     expected, actual, remedy = (
         ("a run to resume", "no run.json", "Train without --resume, or name the folder of a run.")
         if resume
         else ("a new folder", "a run", "Add --resume (resume=True) to continue it, or name another folder.")
     )
-    return PolarguideError(out, expected=expected, found=actual, remedy=remedy)
+    raise PolarguideError(out, expected=expected, found=actual, remedy=remedy)
 
 
 def check_trainable(scene: Scene) -> None:
@@ -271,8 +239,8 @@ def check_same_run(old: RunConfiguration, new: RunConfiguration, out: Path) -> N
             remedy=f"Use --steps {old.settings.steps}, or train with --steps {new.settings.steps} into a new folder: "
             "stages are shares of all steps, so that their number is fixed.",
         )
-    # The place of the scene and the device do not change the result; painted materials may change.
-    for field in sorted(old.__annotations__.keys() - {"scene", "device", "painted"}):
+    # The place of the scene and the device do not change the result.
+    for field in sorted(old.__annotations__.keys() - {"scene", "device"}):
         a = getattr(old, field)
         b = getattr(new, field)
         if a != b and a is not None:
@@ -312,34 +280,6 @@ def check_step(step: int, settings: ResolvedSettings, out: Path) -> None:
             found=f"the state after step {step}",
             remedy="Train again into a new folder.",
         )
-
-
-def _go_back(
-    state: TrainingState | None, recipe: Recipe, settings: ResolvedSettings, out: Path, reporter: Reporter
-) -> None:
-    """Return to the last step that searches for metals, so that painted materials have an effect.
-
-    Args:
-        state: state of the training, which is changed in place. None if the training has not begun.
-
-    Raises:
-        PolarguideError: the recipe does not use materials, or the training is too short.
-    """
-    last = max(looks(recipe, settings), default=None)
-    if last is None:
-        raise PolarguideError(
-            out / FOLDER,
-            expected="a training with a search for metals",
-            found=f"{recipe.name} in {settings.steps} steps, with --materials {settings.materials}",
-            remedy="Remove the folder, or train polarguide-stokes in 1,500 steps or more.",
-        )
-    if state is not None and state.step > last:
-        reporter.say(
-            f"{out / FOLDER} has changed: training continues at step {last}, which decides on metals"
-        )
-        state.step = last
-        state.drop("frozen.")
-        state.footprints = None
 
 
 def ignored_filters(recipe: str) -> str:

@@ -337,8 +337,3 @@ def single_colors(
     splatted = GBuffer(features, torch.ones_like(features[..., 0]), layout)
     final: Tensor = shading.shade(splatted, light, _RayCamera(rays))["final"]
     return final[:, 0]
-
-
-def diffuse_colors(gaussians: Parameters, shading: ShadingModel, rays: Tensor) -> Tensor:
-    """Return linear colors [N, 3] of Gaussians without reflections, along unit rays [N, 3]."""
-    return _values_along(gaussians, shading, rays, -rays)["color"]

@@ -9,7 +9,6 @@ from typing import Any, Generic, TypeVar
 from torch import Tensor
 
 from polarguide.core.errors import PolarguideError
-from polarguide.training.distributed import Ranks
 from polarguide.training.recipe import Position
 from polarguide.training.settings import ResolvedSettings, StepReport
 from polarguide.training.state import SavedState
@@ -55,9 +54,6 @@ class Callback(Generic[LoopKind]):
     def at_end(self, loop: LoopKind) -> None:
         """Run after the last step."""
 
-    def before_checkpoint(self, loop: LoopKind) -> None:
-        """Run on every rank before the first rank writes a checkpoint."""
-
     def state_dict(self) -> dict[str, Tensor]:
         """Return the tensors that a resumed training needs."""
         return {}
@@ -74,7 +70,6 @@ class Loop(ABC):
 
     Attributes:
         settings: settings of the training.
-        ranks: processes that share the training.
         callbacks: callbacks in the order of their calls.
         observers: callbacks that run after all other callbacks, when the step is complete. They do not change the
             state.
@@ -86,9 +81,8 @@ class Loop(ABC):
 
     state: SavedState
 
-    def __init__(self, settings: ResolvedSettings, ranks: Ranks, callbacks: Sequence[AnyCallback]) -> None:
+    def __init__(self, settings: ResolvedSettings, callbacks: Sequence[AnyCallback]) -> None:
         self.settings = settings
-        self.ranks = ranks
         self.callbacks = list(callbacks)
         self.observers: list[AnyCallback] = []
         self.whole = True
@@ -131,12 +125,6 @@ class Loop(ABC):
         Returns:
             A tuple of ``StepReport.measured``, the name of the stage, and the number of Gaussians.
         """
-
-    def saved_state(self) -> SavedState:
-        """Return the state for a checkpoint, with the sums of all ranks. Every rank has to call it."""
-        for callback in self.callbacks:
-            callback.before_checkpoint(self)
-        return self.state
 
 
 def stateful(callbacks: Iterable[AnyCallback]) -> list[AnyCallback]:

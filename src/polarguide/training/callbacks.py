@@ -197,7 +197,6 @@ class NormalOrientation(Callback[TrainingLoop]):
         gaussians = loop.state.gaussians
         views = context.memory.between(context.views)
         outward = outward_directions(gaussians, views, context.backend.rasterize)
-        loop.ranks.broadcast(outward)
         gaussians.overwrite("outward", outward)
 
 
@@ -235,7 +234,6 @@ class IndexOffsets(Callback[TrainingLoop]):
             context.backend.rasterize,
             context.memory,
         )
-        loop.ranks.broadcast(offsets)
         gaussians.overwrite("index_offset", offsets)
 
 
@@ -274,10 +272,7 @@ class PriorRefresh(Callback[TrainingLoop]):
 
 
 class DensityControl(Callback[TrainingLoop]):
-    """Callback that adds and removes Gaussians in stages with density control.
-
-    The decisions depend on the statistics of all ranks.
-    """
+    """Callback that adds and removes Gaussians in stages with density control."""
 
     prefix = "statistics."
     name = "density_control"
@@ -309,7 +304,6 @@ class DensityControl(Callback[TrainingLoop]):
         density = context.recipe.densification
         state = loop.state
         if state.step % density.every == 0:
-            self.before_checkpoint(loop)
             densify(
                 state.gaussians,
                 self._statistics,
@@ -323,11 +317,6 @@ class DensityControl(Callback[TrainingLoop]):
             )
         if state.step >= settings.steps or not loop.schedule.at(state.step).stage.densify:
             self._prune_untouched(loop)
-
-    def before_checkpoint(self, loop: TrainingLoop) -> None:
-        """Exchange the statistics since the last densification among the ranks."""
-        for sums in self.state_dict().values():
-            loop.ranks.exchange_slots(sums if sums.ndim == 2 else sums[None])
 
     def state_dict(self) -> dict[str, Tensor]:
         return {"gradient": self._statistics.gradient, "seen": self._statistics.seen}
@@ -348,8 +337,6 @@ class DensityControl(Callback[TrainingLoop]):
             return
         cameras = context.memory.between(view.camera for view in context.views)
         touched = touched_pixels(gaussians, cameras, context.backend.rasterize)
-        for values in touched:
-            loop.ranks.broadcast(values)
         keep = touched.most >= density.faint_pixels
         if context.black:
             enough = len(context.views) >= density.enough_views

@@ -15,7 +15,6 @@ from polarguide.core.system import UNBOUNDED, MemoryBound
 from polarguide.gaussians.initialize import camera_reach, scene_extent
 from polarguide.raster import Backend
 from polarguide.shading.model import ShadingModel
-from polarguide.training.distributed import ALONE, Ranks
 from polarguide.training.recipe import Recipe
 from polarguide.training.settings import ResolvedSettings
 from polarguide.training.storage import ViewStore
@@ -30,7 +29,6 @@ class TrainingContext:
         recipe: the method.
         settings: the user's settings.
         backend: device and rasterizer.
-        ranks: the processes that share the views of each step.
         store: cache of computed targets of the views.
         memory: object that returns freed memory to the system.
         reporter: object that receives messages for the user.
@@ -40,7 +38,6 @@ class TrainingContext:
     recipe: Recipe
     settings: ResolvedSettings
     backend: Backend
-    ranks: Ranks = ALONE
     store: ViewStore = field(default_factory=ViewStore)
     memory: MemoryBound = UNBOUNDED
     reporter: Reporter = SILENT

@@ -52,7 +52,7 @@ class TrainingLoop(Loop):
         state: TrainingState | None = None,
         first: TrainingContext | None = None,
     ) -> None:
-        super().__init__(context.settings, context.ranks, callbacks)
+        super().__init__(context.settings, callbacks)
         self.context = context
         self.begin(first or context, state)
 
@@ -89,24 +89,22 @@ class TrainingLoop(Loop):
                     callback.act(self)
 
     def optimize(self) -> tuple[Tensor, str, int]:
-        """Render the views of this rank, and change the parameters by the mean gradient of all views."""
+        """Render the views of a step, and change the parameters by their mean gradient."""
         views = self.settings.views_per_step
-        slots = self.ranks.slots(views)
-        # A rank without a view renders the first one to learn which tensors have gradients, and adds nothing.
-        measured = [self.backpropagate(slot, counts=bool(slots)) for slot in slots or range(1)]
+        measured = [self.backpropagate(slot) for slot in range(views)]
         self.whole = False
-        trained = (*self.state.gaussians.trained(), *self.state.light.values())
-        self.ranks.average([t.grad for t in trained if t.grad is not None], views)
+        if views > 1:
+            trained = (*self.state.gaussians.trained(), *self.state.light.values())
+            torch._foreach_div_([t.grad for t in trained if t.grad is not None], float(views))
         self.update_parameters()
         mean = measured[0] if len(measured) == 1 else torch.stack(measured).mean(dim=0)
         return mean, self.position.stage.name, len(self.state.gaussians)
 
-    def backpropagate(self, slot: int, *, counts: bool = True) -> Tensor:
+    def backpropagate(self, slot: int) -> Tensor:
         """Render the view of a slot and add its gradients.
 
         Args:
             slot: number of the view in this step.
-            counts: True to call the callbacks after the backward pass.
 
         Returns:
             ``StepReport.measured``.
@@ -126,13 +124,12 @@ class TrainingLoop(Loop):
         )
         if stage.behind is not None and request.normal_rotation_only:
             result = fade_behind(result, *(share * context.reach for share in stage.behind))
-        scales = state.gaussians["log_scales"]
-        step = Step(result, targets, shading, scales, context.extent, context.recipe.ssim_weight, statistic)
+        ssim_weight = context.recipe.ssim_weight
+        step = Step(result, targets, shading, state.gaussians, context.extent, ssim_weight, statistic)
         loss = step_loss(step, stage.weights)
         loss.total.backward()
-        if counts:
-            for callback in self.callbacks:
-                callback.after_backward(self, step, slot)
+        for callback in self.callbacks:
+            callback.after_backward(self, step, slot)
         return loss.measured()
 
     def update_parameters(self) -> None:

@@ -492,7 +492,8 @@ def flatness_term(step: Step, weights: Weights) -> Tensor | None:
     """Return the weighted flatness of the visible Gaussians."""
     if not weights.flatness:
         return None
-    return weights.flatness * flatness_loss(step.log_scales, step.result.training["radii"], step.extent)
+    log_scales = step.gaussians["log_scales"]
+    return weights.flatness * flatness_loss(log_scales, step.result.training["radii"], step.extent)
 
 
 def coverage_term(step: Step, weights: Weights) -> Tensor | None:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
+
+import tyro
 
 from polarguide.core.errors import PolarguideError
 from polarguide.core.options import EXPOSURES, MOST, Exposures, check_choice, check_count
@@ -45,7 +47,7 @@ class TrainSettings:
         refractive_index: Refractive index of the surfaces: 1.5 for glass, plastic and glaze, 1.33 for water. None: the
             value in scene.json, or 1.5.
         views_per_step: Number of views whose mean gradient makes a step. Learning rates grow with its square root. The
-            number of steps stays the same, so that more views are rendered. None: one for each process.
+            number of steps stays the same, so that more views are rendered. None: one.
         background: Background of the subject. scene: surroundings, which are reconstructed. black: no background, the
             pictures are black there. masked: no background, pixels outside masks/ are set to black. auto: black if the
             edges of the pictures are black, else scene.
@@ -66,7 +68,7 @@ class TrainSettings:
     background: Background = "auto"
     gaussians: int | None = None
     exposures: Exposures = "captured"
-    begin_again: bool = True
+    begin_again: Annotated[bool, tyro.conf.Fixed, tyro.conf.Suppress] = True
     materials: Materials = "auto"
 
     def __post_init__(self) -> None:

@@ -133,10 +133,6 @@ class TrainingState:
         """Return the names of callbacks of the user that have tensors in a checkpoint."""
         return {name.split(".")[1] for name in self._held() if name.startswith("callback.")}
 
-    def drop(self, prefix: str) -> None:
-        """Drop the tensors of a holder that is not attached."""
-        self.extra = {name: values for name, values in self.extra.items() if not name.startswith(prefix)}
-
     def _held(self) -> dict[str, Tensor]:
         """Return the tensors of all holders by their names in a checkpoint."""
         attached = {

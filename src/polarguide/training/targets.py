@@ -11,6 +11,7 @@ from torch import Tensor
 from polarguide import optics
 from polarguide.capture import View
 from polarguide.capture.exposures import analyzers, radiance_places
+from polarguide.gaussians.gaussians import Parameters
 from polarguide.geometry.camera import Camera
 from polarguide.optics.color import srgb_encode
 from polarguide.raster import ScreenStatistic
@@ -173,7 +174,7 @@ class Step:
         result: the rendered layers.
         targets: targets of the rendered layers.
         shading: shading model of the stage, with the refractive index of the run.
-        log_scales: [N, 3] logarithms of the scales of the Gaussians.
+        gaussians: the Gaussians. Terms may read their tensors, such as ``log_scales`` [N, 3].
         extent: extent of the scene.
         ssim_weight: lambda of the image terms.
         statistic: gradient of the projected means, known after the backward pass. None without density control.
@@ -182,7 +183,7 @@ class Step:
     result: RenderResult
     targets: StepTargets
     shading: ShadingModel
-    log_scales: Tensor
+    gaussians: Parameters
     extent: float
     ssim_weight: float = 0.2
     statistic: ScreenStatistic | None = None

@@ -36,7 +36,7 @@ CAMERA_LIMITS = {
 }  # fmt: skip
 """Valid range of each number of a camera. The field of view is in radians."""
 NO_RAY = {"ray_origin": (0.0,) * 3, "ray_direction": (0.0, 0.0, 1.0)}
-"""Placeholder for the ray of a click. A session computes the ray from the clicked position in the window."""
+"""Placeholder for the ray of a click on a camera, which the viewer does not use."""
 
 Accepts = Callable[[Any], Any]
 """Function that clamps the value of a control to its range, and raises ``Refused`` for a value of another type."""
@@ -72,10 +72,6 @@ def checked_message(raw: bytes | str, control: Callable[[str], Accepts | None], 
         elif kind == "SceneNodeClickMessage":
             names = {"name": str(message["name"]), "owner": str(message.get("owner", ""))[:100]}
             fields = {**names, **NO_RAY, "instance_index": None, "modifier": None, "screen_pos": (0.0, 0.0)}
-        elif kind == "ScenePointerMessage" and message["event_type"] == "click":
-            (place,) = message["screen_pos"]
-            clicked = (tuple(_clamped(value, 0.0, 1.0) for value in _numbers(place, 2)),)
-            fields = {**NO_RAY, "event_type": "click", "screen_pos": clicked, "modifier": None}
         else:
             return None
     except (LookupError, TypeError, ValueError, RecursionError, OverflowError) as error:

@@ -14,7 +14,6 @@ from polarguide.gaussians.gaussians import Gaussians
 from polarguide.geometry.camera import Camera
 from polarguide.geometry.scene_frame import SceneFrame
 from polarguide.raster.interface import Rasterize
-from polarguide.results.rendering.picking import SurfacePoint, surface_at
 from polarguide.results.rendering.relight import RELIT_RESOLUTION, turned_cubemap
 from polarguide.runs.opened import OpenedRun
 from polarguide.shading.gbuffer import RenderRequest, render
@@ -259,19 +258,6 @@ class Painter:
         if scale is None or picture.shape[1] < 2 * least:
             return picture  # the legend would hide the picture
         return figures.with_key(picture, scale, width)
-
-    def point(
-        self,
-        scenery: Scenery,
-        camera: Camera,
-        appearance: Appearance,
-        view: View | None,
-        place: tuple[float, float],
-    ) -> SurfacePoint | None:
-        """Return the surface at a position in a picture. ``place`` contains shares of width and height."""
-        camera = drawn_camera(camera, view)
-        result = self._result(scenery, camera, replace(appearance, layer="depth", strength=1.0, turn=0.0))
-        return surface_at(result, camera, place[0] * camera.width, place[1] * camera.height)
 
     def _result(self, scenery: Scenery, camera: Camera, appearance: Appearance) -> RenderResult:
         crop = appearance.presentation.crop

@@ -23,7 +23,6 @@ from polarguide.capture import Scene
 from polarguide.capture.presentation import (
     PRESENTATION_FILE,
     Presentation,
-    Vector,
     read_presentation,
     write_presentation,
 )
@@ -32,17 +31,14 @@ from polarguide.core.options import LOOPBACK, VisitorOptions
 from polarguide.core.progress import SILENT, Reporter
 from polarguide.core.system import network_address
 from polarguide.geometry.scene_frame import scene_frame
-from polarguide.results.rendering.picking import gray_world_gains
 from polarguide.runs.model import layers_of
 from polarguide.runs.opened import OpenedRun
-from polarguide.runs.painted import FOLDER, read_painted, write_painted
 from polarguide.runs.train import Ends, Look
 from polarguide.shading.model import ShadingModel
 from polarguide.training.loop import TrainingLoop
 from polarguide.viewer.cameras import Photograph, photographs
 from polarguide.viewer.guard import Accepts, Gate, checked_message, guarded
-from polarguide.viewer.painting import Materials, Paintable, kinds_of
-from polarguide.viewer.panel import KINDS, PanelOptions
+from polarguide.viewer.panel import PanelOptions
 from polarguide.viewer.scenery import UNCHANGED, Scenery, run_scenery, training_scenery
 from polarguide.viewer.session import Session
 
@@ -77,7 +73,6 @@ class Viewer:
         presentation: the saved presentation.
         save: function that writes a presentation to the run and returns a message in plain text. With None, browsers
             download the presentation. Browsers on other machines can never save.
-        paintable: materials that can be painted, or None. Painting requires that no other machine can connect.
         title: title of the page, plain text.
         warn: callback that receives the reason why a connection was closed.
         beside: another run, which wipes show.
@@ -98,7 +93,6 @@ class Viewer:
         visitors: VisitorOptions = VisitorOptions(),
         presentation: Presentation = UNCHANGED,
         save: Callable[[Presentation], str] | None = None,
-        paintable: Paintable | None = None,
         title: str = "polarguide",
         warn: Callable[[str], None] = lambda text: None,
         beside: Scenery | None = None,
@@ -113,11 +107,9 @@ class Viewer:
         turns = shading.radiance_cubemap is not None
         others = visitors.allow_host or visitors.allow_origin
         self._save = save if host in LOOPBACK and not others else None
-        self._paintable = None if self._save is None else paintable
-        kinds = {} if self._paintable is None else self._paintable.kinds
         saves = self._save is not None
         self._options = PanelOptions(
-            layers_of(shading), turns, tuple(photographs), trains, presentation, saves, kinds
+            layers_of(shading), turns, tuple(photographs), trains, presentation, saves
         )
         self._sessions: dict[int, Session] = {}
         self._lock = threading.Lock()
@@ -158,9 +150,7 @@ class Viewer:
                 self._scene_frame,
                 self._options,
                 self._wake.set,
-                gray_world=lambda: self._gray,
                 save=None if self._save is None else self._saved,
-                paintable=self._paintable,
                 drop=drop,
                 beside=self._beside,
             )
@@ -171,14 +161,6 @@ class Viewer:
         with self._lock:
             self._sessions[client.client_id] = session
         self._wake.set()
-
-    @functools.cached_property
-    def _gray(self) -> Vector:
-        """White balance gains that make the mean of the photographs gray."""
-        photographs = self._photographs.values()
-        return gray_world_gains(
-            [p.view for p in photographs if not p.held_out] or [p.view for p in photographs]
-        )
 
     def _saved(self, presentation: Presentation) -> str:
         """Save a presentation, and use it as the initial presentation of new sessions."""
@@ -332,49 +314,22 @@ def view_run(
         presentation=run.presentation,
         save=functools.partial(save_to_run, run),
         beside=None if beside is None else run_scenery(beside),
-        paintable=paintable_run(run),
     ) as viewer:
         while True:
             viewer.serve(1.0)
 
 
-def paintable_run(run: OpenedRun) -> Paintable | None:
-    """Return the materials that visitors can paint on a run, or None if its recipe has no metals."""
-    if "metalness" not in run.model.shading.parameters:
-        return None
-    model = run.model
-    scene = run.scene
-    gaussians = model.state.gaussians
-    rasterize = model.backend.rasterize
-    kinds = {name: number for number, name in enumerate(KINDS)}
-    kinds |= {f"dielectric of index {index:g}": number for number, index in sorted(scene.indices.items())}
-
-    def materials() -> Materials:
-        painted = read_painted(run.folder, scene)
-        if painted is None:
-            return Materials(gaussians, rasterize)
-        first = functools.partial(kinds_of, gaussians, rasterize, scene.train_views, painted.numbers)
-        return Materials(gaussians, rasterize, first)
-
-    def save(materials: Materials) -> str:
-        pictures = {view.name: materials.picture(view.camera) for view in scene.train_views}
-        write_painted(run.folder, pictures)
-        return f"Saved to {FOLDER}/ of the run; polarguide train --resume goes on with them"
-
-    return Paintable(materials, kinds, save)
-
-
 def save_to_run(run: OpenedRun, chosen: Presentation) -> str:
-    """Write color, up axis, scale and crop box to the run's ``presentation.json``, and return a message in plain text.
+    """Write exposure and crop box to the run's ``presentation.json``, and return a message in plain text.
 
-    A value that equals the value of the scene is not written, so that the run still inherits it. The credit of the run
-    is not changed.
+    A value that equals the value of the scene is not written, so that the run still inherits it. Other values of the
+    run are not changed.
     """
     own = read_presentation(run.folder)
     above = read_presentation(run.scene_folder)
     fields = {}
     unchanged = []
-    for name in ("white_balance", "chart", "exposure", "up_axis", "meters_per_unit", "crop"):
+    for name in ("exposure", "crop"):
         value = getattr(chosen, name)
         inherited = getattr(above, name)
         fields[name] = None if value == inherited else value
@@ -398,15 +353,8 @@ def watched(
     """Open a viewer for a training. The context yields the function that the training calls between steps.
 
     Raises:
-        PolarguideError: the training has several processes, or the server cannot listen at the address.
+        PolarguideError: the server cannot listen at the address.
     """
-    if loop.ranks.world > 1:
-        raise PolarguideError(
-            "viewer",
-            expected="one process",
-            found=f"{loop.ranks.world}",
-            remedy="Omit this option, and view the checkpoints with polarguide view RUN.",
-        )
     scene = loop.context.scene
 
     def look(ends: Ends) -> None:

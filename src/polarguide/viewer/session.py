@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from polarguide.capture.presentation import PRESENTATION_FILE, Presentation, Vector
+from polarguide.capture.presentation import PRESENTATION_FILE, Presentation
 from polarguide.core.records import to_json
 from polarguide.geometry.camera import Camera
 from polarguide.geometry.scene_frame import SceneFrame
@@ -19,15 +19,13 @@ from polarguide.viewer.cameras import (
     Frusta,
     Photograph,
     ViewPose,
-    drawn_camera,
     free_camera,
     keyframe,
     keyframe_path,
     move_to_view,
     path_json,
 )
-from polarguide.viewer.painting import Paintable, Painting
-from polarguide.viewer.panel import FREE_VIEW, Panel, PanelOptions, Presenting
+from polarguide.viewer.panel import FREE_VIEW, Panel, PanelOptions
 from polarguide.viewer.scenery import Painter, Scenery
 from polarguide.visualization.figures import png_bytes
 
@@ -116,10 +114,8 @@ class Session:
         scene_frame: frame of the scene.
         options: options of the panel.
         wake: callback that is called when a picture may be due.
-        gray_world: function that returns white balance gains which make the mean of the photographs gray.
         save: function that writes a presentation to the run and returns a message. With None, the browser downloads the
             presentation.
-        paintable: materials that can be painted.
         drop: callback that receives the exception of another callback and closes the connection.
         beside: another run, which wipes show.
     """
@@ -132,9 +128,7 @@ class Session:
         options: PanelOptions,
         wake: Callable[[], None],
         *,
-        gray_world: Callable[[], Vector] = lambda: (1.0, 1.0, 1.0),
         save: Callable[[Presentation], str] | None = None,
-        paintable: Paintable | None = None,
         drop: Callable[[Exception], None] = _raise,
         beside: Scenery | None = None,
     ) -> None:
@@ -158,17 +152,7 @@ class Session:
         upright = client.camera.image_width < client.camera.image_height  # as on a phone
         self.panel = panel = Panel(client.gui, options, self._changed, drop, folded=upright)
         self._save = save
-        self._presenting = Presenting(
-            client,
-            panel,
-            options.presentation,
-            gray_world=gray_world,
-            save=self._save_presentation,
-            distance=scene_frame.distance,
-        )
-        self._painting = None
-        if paintable is not None and options.kinds:
-            self._painting = Painting(client, panel, paintable, busy=lambda: self._presenting.picks)
+        self._up_axis = options.presentation.up_axis
         self._frusta = Frusta(
             client.scene,
             list(photographs.values()),
@@ -187,6 +171,7 @@ class Session:
             "seconds": self._show_count,
             "play": self._play,
             "save_path": self._save_path,
+            "save": lambda: panel.show_note(self._save_presentation()),
         }
         for name, act in callbacks.items():
             panel.listen(name, act)
@@ -214,14 +199,14 @@ class Session:
     def _changed(self) -> None:
         with self._lock:
             self.pacing.mark_changed(time.monotonic())
-        crop = self.panel.crop(self._presenting.chosen.up_axis)
+        crop = self.panel.crop()
         self._frusta.show_box(crop if self.panel["box"].value else None)
         self._wake()
 
     def _save_presentation(self) -> str:
         if self._soon_again("presentation"):
             return "Saved just now"
-        chosen = self.panel.presentation(self._presenting.chosen)
+        chosen = self.panel.presentation()
         if self._save is not None:
             return self._save(chosen)
         content = to_json(chosen.to_record())
@@ -240,8 +225,8 @@ class Session:
             if pose is not self._view_pose:
                 self._view_pose = pose
                 self.panel["view"].value = FREE_VIEW if pose is None else pose.view.name
-                if pose is None:
-                    self._presenting.turn_upright()
+                if pose is None and self._up_axis is not None:
+                    self._client.camera.up_direction = np.array(self._up_axis)
         self._wake()
 
     def go(self, name: str) -> None:
@@ -329,8 +314,7 @@ class Session:
         """Return the kind of picture that is due: "coarse", "sharp", or None."""
         with self._lock:
             self._follow_path()
-            waits = self._presenting.waits or (self._painting is not None and self._painting.waits)
-            return "sharp" if self._screenshot or waits else self.pacing.due(time.monotonic())
+            return "sharp" if self._screenshot else self.pacing.due(time.monotonic())
 
     def draw(self, scenery: Scenery, kind: str) -> None:
         """Render a picture and send it to the browser."""
@@ -345,16 +329,8 @@ class Session:
             viewpoint = self._camera(frame_size)
         view = None if view_pose is None else view_pose.view
         sharp = kind == "sharp"
-        if (place := self._presenting.take_click()) is not None:
-            appearance = self.panel.appearance(self._presenting.chosen)
-            hit = self._painter.point(scenery, viewpoint, appearance, view, place)
-            self.panel.caught(lambda: self._presenting.found(hit))(None)
-        appearance = self.panel.appearance(self._presenting.chosen)
+        appearance = self.panel.appearance()
         picture = self._painter.paint(scenery, viewpoint, appearance, view, settled=sharp)
-        if self._painting is not None and picture is not None:
-            drawn = drawn_camera(viewpoint, view)
-            self._painting.act(drawn)
-            picture = self._painting.tinted(picture, drawn)
         image = picture
         if image is None:
             image = np.full((frame_size[1], frame_size[0], 3), 64, dtype=np.uint8)

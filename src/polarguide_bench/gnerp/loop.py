@@ -18,7 +18,6 @@ from polarguide.geometry.vectors import dot, unit
 from polarguide.optics import aolp, dolp, lens_frame, luminance
 from polarguide.optics.color import srgb_encode
 from polarguide.training.callback import Loop
-from polarguide.training.distributed import ALONE
 from polarguide.training.settings import ResolvedSettings
 from polarguide.training.state import seeded
 from polarguide.training.storage import Entry, Packed, ViewStore, packed, stored_values
@@ -194,7 +193,7 @@ class FieldLoop(Loop):
         state: FieldState | None = None,
         store: ViewStore | None = None,
     ) -> None:
-        super().__init__(settings, ALONE, ())
+        super().__init__(settings, ())
         self.scene = scene
         self.recipe = recipe
         self._device = device

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from polarguide.capture import Scene
 from polarguide.core.errors import require
@@ -29,11 +30,11 @@ from polarguide.runs.folder import CHECKPOINT, RunConfiguration, checkpoint_tens
 from polarguide.runs.memory_plan import PROCESS, MemoryPlan, pixels_of, share_memory
 from polarguide.runs.opened import read_scene, trained_scene
 from polarguide.runs.train import (
+    check_run_folder,
     check_same_run,
     check_step,
     check_trainable,
     ignored_filters,
-    unsuitable_folder,
     view_store,
 )
 from polarguide.training.settings import ResolvedSettings, TrainSettings
@@ -109,6 +110,9 @@ class FieldRun:
         """Cameras of the scene's views by name."""
         return {view.name: view.camera for view in self.scene.views}
 
+    def undecided(self, camera: Camera) -> Tensor | None:
+        """Return None, because a field has no metals."""
+
     def surface(self) -> Surface:
         """Extract the surface, which is the zero set of the signed distance, for scores of the mesh.
 
@@ -149,8 +153,7 @@ def train_field(
     """
     out = Path(out)
     use_threads(session.threads)
-    if problem := unsuitable_folder(out, resume):
-        raise problem
+    check_run_folder(out, resume)
     backend = choose_backend(session.device, say=reporter.say)
     plan = plan_field_memory(pixels_of(Path(scene), reading.downscale), recipe, limit=reading.memory)
     earlier = RunConfiguration.load(out) if resume else None

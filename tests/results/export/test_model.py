@@ -10,7 +10,6 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 import torch
@@ -27,7 +26,7 @@ from polarguide.geometry.scene_frame import scene_frame
 from polarguide.optics.color import srgb_decode_array
 from polarguide.results.export.model import build
 from polarguide.results.export.model.build import charted_subject, require_room, textured_model
-from polarguide.results.export.model.gltf import Textured, color_pixels, write_glb, write_obj
+from polarguide.results.export.model.gltf import Textured, color_pixels, write_glb
 from polarguide.results.export.model.irradiance import Surroundings, arriving_light, irradiance
 from polarguide.results.export.model.topology import Topology, cleaned, topology
 from polarguide.results.export.model.unwrap import Unwrapped, rasterized_texels, unwrap
@@ -334,22 +333,6 @@ def test_light_that_gaussians_add_is_folded_in() -> None:
     found.append(cubemap.radiance(mirrored_light(run, cubemap, lambda *_: None)))
     for values, expected in zip(found, (3.0, 0.2), strict=True):
         np.testing.assert_allclose(values, expected, rtol=5e-3)
-
-
-def test_an_obj_holds_the_same(tmp_path: Path) -> None:
-    model = model_of(tmp_path / "parts", base_color="diffuse")
-    paths = write_obj(tmp_path, model, ["a comment"], jpeg=False)
-    assert sorted(path.name for path in paths) == sorted(p.name for p in tmp_path.iterdir() if p.is_file())
-    mesh = trimesh.load(tmp_path / "model.obj", process=False)
-    np.testing.assert_allclose(mesh.vertices[mesh.faces], model.vertices[model.faces], atol=1e-5)
-    corner = np.stack([model.uv[:, 0], 1 - model.uv[:, 1]], axis=1)[model.faces]
-    np.testing.assert_allclose(mesh.visual.uv[mesh.faces], corner, atol=1e-5)
-    np.testing.assert_array_equal(np.array(mesh.visual.material.image), model.base_color)
-    assert model.surface is not None
-    for channel, name in ((1, "roughness"), (2, "metalness")):
-        assert f"map_P{name[0]} model-{name}.png" in (tmp_path / "model.mtl").read_text()
-        pixels = cv2.imread(str(tmp_path / f"model-{name}.png"))
-        np.testing.assert_array_equal(pixels[..., 0], model.surface[..., channel])
 
 
 def test_a_crop_box_takes_part_of_it_and_the_rest_still_shades(tmp_path: Path) -> None:

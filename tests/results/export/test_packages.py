@@ -187,7 +187,7 @@ def test_no_file_names_the_machine(credited: Path, tmp_path: Path) -> None:
     scene = json.loads((credited / "run.json").read_text())["scene"]
     folders = {str(tmp_path), str(Path.home()), str(Path(scene).parent)}
     secrets = folders | {name for name in (getpass.getuser(), socket.gethostname()) if len(name) > 5}
-    for kind in set(get_args(ExportFormat)) - {"points"}:  # all are too faint yet
+    for kind in get_args(ExportFormat):
         for package in EXPORT_PACKAGES.get(kind, ()):
             pytest.importorskip(package)
         exported(credited, out / kind, kind)

@@ -28,6 +28,22 @@ VALIDATE = """
 const validator = require("gltf-validator"), file = require("fs").readFileSync(process.argv[1]);
 validator.validateBytes(new Uint8Array(file), { maxIssues: 0 }).then((r) => console.log(JSON.stringify(r.issues)));
 """
+FLOAT = 5126
+ATTRIBUTES = {
+    "POSITION": "VEC3",
+    f"{EXTENSION}:ROTATION": "VEC4",
+    f"{EXTENSION}:SCALE": "VEC3",
+    f"{EXTENSION}:OPACITY": "SCALAR",
+    **{f"{EXTENSION}:SH_DEGREE_{n}_COEF_{k}": "VEC3" for n in range(4) for k in range(2 * n + 1)},
+}
+"""Attributes of the kernel ``ellipse`` with their accessor types, from the section Attributes of the specification."""
+PROPERTIES = {
+    "kernel": {"ellipse"},
+    "colorSpace": {"srgb_rec709_display", "lin_rec709_display"},
+    "projection": {"perspective"},
+    "sortingMethod": {"cameraDistance"},
+}
+"""Values in ``mesh.primitive.KHR_gaussian_splatting.schema.json`` of KhronosGroup/glTF."""
 UNKNOWN = "MESH_PRIMITIVE_INVALID_ATTRIBUTE"
 """The validator's code for attributes of an extension that it does not know."""
 
@@ -41,7 +57,13 @@ def test_the_file_holds_what_the_extension_wants(encoding: Any, tmp_path: Path) 
     ply, (tree, found) = read_ply(tmp_path / "a.ply"), read_glb(tmp_path / "a.glb")
     primitive = tree["meshes"][0]["primitives"][0]
     assert primitive["mode"] == 0
-    assert primitive["extensions"][EXTENSION]["colorSpace"] == COLOR_SPACES[encoding]
+    about = primitive["extensions"][EXTENSION]
+    assert about["colorSpace"] == COLOR_SPACES[encoding]
+    assert about.keys() == PROPERTIES.keys()
+    assert all(about[name] in values for name, values in PROPERTIES.items())
+    accessors = {name: tree["accessors"][number] for name, number in primitive["attributes"].items()}
+    assert {name: each["type"] for name, each in accessors.items()} == ATTRIBUTES
+    assert {each["componentType"] for each in accessors.values()} == {FLOAT}
     assert tree["extensionsUsed"] == [EXTENSION]
     values = {name.removeprefix(EXTENSION + ":"): each for name, each in found.items()}
     np.testing.assert_array_equal(values["POSITION"], ply["means"])

@@ -12,16 +12,18 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from numpy.lib.recfunctions import structured_to_unstructured
 from plyfile import PlyData
 from random_runs import random_state, ring
 from scipy.spatial.transform import Rotation
 from torch.nn.functional import normalize
 
+import polarguide
 from polarguide.capture.presentation import Presentation
 from polarguide.core.errors import PolarguideWarning
 from polarguide.gaussians.geometry import quaternions_to_rotations, shortest_axis_normals
 from polarguide.gaussians.harmonics import evaluate_sh, sh_basis
-from polarguide.gaussians.ply import read_ply, write_ply
+from polarguide.gaussians.ply import RELEASE_FIELDS, read_ply, write_ply
 from polarguide.geometry.scene_frame import scene_frame
 from polarguide.raster import Splats
 from polarguide.raster.cpu import rasterize_cpu
@@ -67,6 +69,29 @@ def test_a_directional_gaussian_shows_its_albedo_and_the_light_in_its_mirror() -
     linear = single_colors(gaussians, state.light, shading, ray.expand(COUNT, 3), facing)
     found = gaussian_colors(state.gaussians, state.light, shading, ray)[:, 0]
     torch.testing.assert_close(found, linear.detach())
+
+
+def test_an_exported_file_has_the_records_of_the_release(trained: Path, tmp_path: Path) -> None:
+    """A viewer that reads 62 floats per record, and a parser that reads fields by name, get the same values."""
+    trimesh = pytest.importorskip("trimesh")
+    run = polarguide.open_run(trained)
+    run.export("ply", tmp_path)
+    lines, _, body = (tmp_path / "splats.ply").read_bytes().partition(b"end_header\n")
+    header = lines.decode("ascii").splitlines()
+    assert header[:2] == ["ply", "format binary_little_endian 1.0"]
+    count = int(header[2].removeprefix("element vertex "))
+    records = np.frombuffer(body, "<f4").reshape(count, 62)
+    cloud = trimesh.load(tmp_path / "splats.ply", process=False)
+    by_name = cloud.metadata["_ply_raw"]["vertex"]["data"]
+    assert by_name.dtype.names == RELEASE_FIELDS
+    np.testing.assert_array_equal(structured_to_unstructured(by_name), records)
+    np.testing.assert_allclose(cloud.vertices, records[:, :3])
+    gaussians = read_ply(tmp_path / "splats.ply")
+    np.testing.assert_array_equal(records[:, 54], gaussians["opacity_logits"])
+    np.testing.assert_array_equal(records[:, 55:58], gaussians["log_scales"])
+    np.testing.assert_array_equal(records[:, 58:62], gaussians["quaternions"])
+    np.testing.assert_array_equal(records[:, 6:9], gaussians["sh_dc"][:, 0])
+    np.testing.assert_array_equal(records[:, 9:24], gaussians["sh_rest"][..., 0])
 
 
 def test_normals_are_the_learned_ones_and_face_the_nearest_camera(tmp_path: Path) -> None:

@@ -147,21 +147,21 @@ def test_a_chart_of_a_scene_reaches_pictures_splats_mesh_points_and_light_of_its
 def exported(folder: Path, out: Path) -> dict[str, torch.Tensor]:
     """Linear colors [N, 3] of what a run's exports and pictures show."""
     trained = polarguide.open_run(folder, device="cpu")
-    for kind in ("ply", "mesh", "points", "environment"):
+    for kind in ("ply", "mesh", "environment"):
         trained.export(kind, out, resolution=24)
     trained.write_pictures(out, views="v001", layers=["final", "dolp"])
     mesh = read_glb(out / "mesh.glb")[1]["COLOR_0"][:, :3]
-    points = PlyData.read(out / "points.ply")["vertex"]
+    vertices = PlyData.read(out / "mesh.ply")["vertex"]
     splats = read_ply(out / "splats.ply")
     shown = 0.5 + sh_basis(torch.tensor([[0.0, 0, 1]]), 3) @ torch.cat(
         (splats["sh_dc"], splats["sh_rest"]), dim=1
     )
-    shades = torch.from_numpy(np.stack([points[name] for name in ("red", "green", "blue")], axis=1)) / 255
+    shades = torch.from_numpy(np.stack([vertices[name] for name in ("red", "green", "blue")], axis=1)) / 255
     final = cv2.imread(str(out / "v001_final.png"))[..., ::-1].reshape(-1, 3) / 255
     return {
         "mesh": torch.tensor(np.asarray(mesh)).float() / 255,
         "splats": srgb_decode(shown[:, 0].clamp(0, 1)),
-        "points": srgb_decode(shades),
+        "mesh, PLY": srgb_decode(shades),
         "light": read_panorama(out / "environment.hdr").reshape(-1, 3),
         "final": srgb_decode(torch.from_numpy(final.copy())).float(),
     }

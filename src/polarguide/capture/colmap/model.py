@@ -380,7 +380,6 @@ def read_model(root: Path) -> ColmapModel:
     folder, kind = find_model(root, itself=False)
     files = tuple(path for path in (folder / (name + kind) for name in MODEL_FILES) if path.exists())
     model = load_model(folder, kind)
-    stale = other_text_model(folder, kind, model)
     images = posed_images(model)
     points, colors, tracks, numbers = _points_of(model)
     dropped = len(model.points3D) - len(points)
@@ -393,7 +392,7 @@ def read_model(root: Path) -> ColmapModel:
     )
     beyond = f"not finite, or farther than {FARTHEST:g}, and were ignored."
     warnings = (
-        *stale,
+        *second_model(folder, kind),
         *([f"{dropped} of {dropped + len(points)} 3D points are {beyond}"] if dropped else []),
     )
     rows = {number: row for row, number in enumerate(numbers)}
@@ -501,59 +500,11 @@ def load_model(folder: Path, kind: str) -> Any:
     return model
 
 
-_DIGITS = 1e-5
-"""Largest relative difference of two numbers that count as equal. Some programs write only six digits as text."""
-
-
-def other_text_model(folder: Path, kind: str, model: Any) -> list[str]:
-    """Return a list with a warning if text files next to a binary model have different content.
-
-    Args:
-        folder: folder of the model.
-        kind: suffix of the files that were read.
-        model: content of these files.
-    """
-    if kind != ".bin" or not all((folder / f"{name}.txt").exists() for name in ("cameras", "images")):
-        return []
-    try:
-        differ = _differing(model, load_model(folder, ".txt"))
-    except PolarguideError as error:
-        return [f"The text model next to {folder / 'images.bin'} is ignored and cannot be read: {error}"]
-    if not differ:
-        return []
-    return [
-        f"{folder} has two models: images.txt has other poses or cameras than images.bin ({listed(differ)}). "
-        "The binary files are used; remove them to use the text files."
-    ]
-
-
-def _differing(model: Any, other: Any) -> list[str]:
-    """Return the names of the images that differ between two models.
-
-    An image differs if one of the models lacks it, or if its poses or cameras differ.
-    """
-    first, second = (
-        {
-            image.name: (image.cam_from_world(), m.cameras[image.camera_id])
-            for image in m.images.values()
-            if image.has_pose
-        }
-        for m in (model, other)
-    )
-    reach = max((float(np.abs(pose.translation).max()) for pose, _ in first.values()), default=0.0)
-
-    def alike(name: str) -> bool:
-        pose, camera = first[name]
-        other_pose, other_camera = second[name]
-        return (
-            camera.model_name == other_camera.model_name
-            and np.allclose(camera.params, other_camera.params, rtol=_DIGITS)
-            and np.allclose(pose.rotation.matrix(), other_pose.rotation.matrix(), rtol=0, atol=_DIGITS)
-            and np.allclose(pose.translation, other_pose.translation, rtol=0, atol=_DIGITS * reach)
-        )
-
-    both = first.keys() & second.keys()
-    return sorted((first.keys() ^ second.keys()) | {name for name in both if not alike(name)})
+def second_model(folder: Path, kind: str) -> tuple[str, ...]:
+    """Return a warning if a folder has a text model next to the binary model that is used."""
+    if kind != ".bin" or not (folder / "images.txt").exists():
+        return ()
+    return (f"{folder} has two models. images.bin is used, and images.txt is ignored.",)
 
 
 @contextlib.contextmanager

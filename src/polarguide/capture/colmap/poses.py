@@ -21,10 +21,10 @@ from polarguide.capture.colmap.model import (
     find_model,
     is_pinhole,
     load_model,
-    other_text_model,
     posed_images,
     posed_model,
     require_sound,
+    second_model,
 )
 from polarguide.capture.filter.develop import remapped_mask
 from polarguide.core.errors import PolarguideError, require
@@ -239,7 +239,7 @@ class Poses:
         files = [folder / (name + kind) for name in MODEL_FILES]
         model = load_model(folder, kind)
         poses = cls(model, folder, views, [file for file in files if file.exists()])
-        poses.warnings = tuple(other_text_model(folder, kind, model))
+        poses.warnings = second_model(folder, kind)
         return poses
 
     @classmethod

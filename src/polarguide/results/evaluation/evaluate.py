@@ -34,6 +34,7 @@ from polarguide.results.evaluation.mesh import mesh_scores
 from polarguide.results.evaluation.metrics import HAZE_DEPTH, Selection, normal_angles_deg
 from polarguide.results.evaluation.record import METRICS_FILE, code_digest, commit, write_metrics
 from polarguide.results.evaluation.scores import ErrorsByObject, ViewScores, score_view
+from polarguide.results.evaluation.table import registered_digests
 from polarguide.results.evaluation.target import SceneFacts, ViewTarget
 from polarguide.results.rendering.mesh import RESOLUTION, Surface, fused_surface
 from polarguide.runs.callbacks import Stopwatch
@@ -323,6 +324,9 @@ class ScoredRun(Protocol):
     def cameras(self) -> dict[str, Camera]:
         """Cameras of the scene's views by name."""
 
+    def undecided(self, camera: Camera) -> Tensor | None:
+        """Render the share [H, W] of possible metals; return None if the training did not search for metals."""
+
 
 def evaluate(
     run: ScoredRun,
@@ -447,6 +451,9 @@ def _score(
     in_front = None
     if target.depth is not None:
         in_front = run.model.alpha_in_front(view.camera, HAZE_DEPTH * target.depth)
+    undecided = None if target.owner is None else run.undecided(view.camera)
+    if undecided is not None:
+        result = result.with_layers(undecided=undecided)
     sheet.add(view, target, result, stokes)
     return score_view(target, result, stokes=stokes, in_front=in_front, by_object=by_object)
 
@@ -489,6 +496,7 @@ def _provenance(run: ScoredRun) -> dict[str, Any]:
         "seed": configuration.settings.seed,
         "commit": commit(),
         "sources": code_digest(),
+        "metrics": registered_digests(),
         "versions": {
             "polarguide": polarguide.__version__,
             "torch": torch.__version__,

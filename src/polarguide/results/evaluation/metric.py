@@ -10,6 +10,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from importlib.metadata import EntryPoint, entry_points
 from typing import Annotated, Any, Literal, get_type_hints
 
@@ -79,7 +80,8 @@ class Metric:
 
 
 GROUP = "polarguide.metrics"
-_REMEDY = "Update or uninstall the package of the plug-in."
+_REMEDY = "Correct the metric, or update or uninstall the package that defines it."
+_VALUE = "a real tensor [] or None from its measure"
 _KINDS = get_type_hints(Metric) | {"digits": Annotated[int, msgspec.Meta(ge=0, le=10)]}
 
 
@@ -91,41 +93,69 @@ def plugged_metrics(known: Collection[str]) -> tuple[Metric, ...]:
     """
     plugged: dict[str, Metric] = {}
     for entry in entry_points(group=GROUP):
+        where = f"plug-in {entry.name} ({entry.value})"
         try:
-            for metric in _loaded(entry):
-                if metric.key in plugged or metric.key in known:
-                    raise _unusable(entry, "a key that no other metric has", metric.key)
-                plugged[metric.key] = metric
+            for metric in _loaded(entry, where):
+                checked = checked_metric(metric, where, {*known, *plugged})
+                plugged[metric.key] = replace(checked, measure=_Guarded(checked.measure))
         except PolarguideError as error:
             warnings.warn(f"{error} The plug-in's metrics are left out.", PolarguideWarning, stacklevel=2)
     return tuple(plugged[key] for key in sorted(plugged))
 
 
-def _loaded(entry: EntryPoint) -> tuple[Metric, ...]:
+def _loaded(entry: EntryPoint, where: str) -> tuple[Any, ...]:
     """Load the metrics of an entry point.
 
     Raises:
-        PolarguideError: the entry point cannot be loaded or is not a metric.
+        PolarguideError: the entry point cannot be loaded.
     """
     try:
         loaded: Any = entry.load()
         loaded = loaded() if callable(loaded) else loaded
-        metrics = (loaded,) if isinstance(loaded, Metric) else tuple(loaded)
+        return (loaded,) if isinstance(loaded, Metric) else tuple(loaded)
     except (Exception, SystemExit) as error:  # Another package may raise anything.
-        raise _unusable(entry, "metrics", f"{type(error).__name__}: {error}") from error
-    for metric in metrics:
-        if not isinstance(metric, Metric):
-            raise _unusable(entry, "metrics", repr(metric))
-        if not callable(metric.measure) or metric.of != "view" or not str(metric.key).isidentifier():
-            raise _unusable(
-                entry, "a metric of views with a measure and an identifier as key", repr(metric.key)
-            )
-        for name in ("label", "unit", "digits", "better", "shown", "timed", "factor"):
-            where = f"plug-in {entry.name} ({entry.value}), {metric.key} ({name})"
-            decode(getattr(metric, name), _KINDS[name], where, remedy=_REMEDY)
-    return tuple(
-        replace(metric, measure=_Guarded(entry, metric.measure)) for metric in metrics if metric.measure
-    )
+        raise _unusable(where, "metrics", f"{type(error).__name__}: {error}") from error
+
+
+def checked_metric(metric: Any, where: str, taken: Collection[str]) -> Metric:
+    """Return a metric of views whose measure raises only PolarguideError.
+
+    Args:
+        metric: the metric.
+        where: origin of the metric for messages.
+        taken: keys of other metrics.
+
+    Raises:
+        PolarguideError: the metric is invalid, or its key is taken.
+    """
+    if not isinstance(metric, Metric):
+        raise _unusable(where, "metrics", repr(metric))
+    if not callable(metric.measure) or metric.of != "view" or not str(metric.key).isidentifier():
+        raise _unusable(where, "a metric of views with a measure and an identifier as key", repr(metric.key))
+    for name in ("label", "unit", "digits", "better", "shown", "timed", "factor"):
+        decode(getattr(metric, name), _KINDS[name], f"{where}, {metric.key} ({name})", remedy=_REMEDY)
+    if metric.key in taken:
+        raise _unusable(where, "a key that no other metric has", metric.key)
+    return replace(metric, measure=partial(_measured, f"{where}, {metric.key}", metric.measure))
+
+
+def _measured(where: str, measure: Measure, target: ViewTarget, layers: Layers) -> Tensor | None:
+    """Compute the value of a view as a tensor [] on the target's device, or return None.
+
+    Raises:
+        PolarguideError: the measure fails, or returns another value.
+    """
+    try:
+        value: Any = measure(target, layers)
+    except (Exception, SystemExit) as error:
+        raise _unusable(where, _VALUE, f"{type(error).__name__}: {error}") from error
+    if value is None:
+        return None
+    if not isinstance(value, Tensor):
+        raise _unusable(where, _VALUE, type(value).__name__)
+    if value.ndim or value.is_complex():
+        raise _unusable(where, _VALUE, f"a tensor {list(value.shape)} of {value.dtype}")
+    return value.detach().to(target.photograph.device)
 
 
 class _Guarded:
@@ -134,32 +164,21 @@ class _Guarded:
     If the measure fails, the metric has no value. The first failure causes a warning.
     """
 
-    def __init__(self, entry: EntryPoint, measure: Measure) -> None:
-        self._entry = entry
+    def __init__(self, measure: Measure | None) -> None:
         self._measure = measure
         self._failed = False
 
     def __call__(self, target: ViewTarget, layers: Layers) -> Tensor | None:
         """Compute the value as a tensor [] on the target's device, or return None."""
+        assert self._measure is not None
         try:
-            value: Any = self._measure(target, layers)
-            if value is None:
-                return None
-            if not isinstance(value, Tensor):
-                found = type(value).__name__
-            elif value.ndim or value.is_complex():
-                found = f"a tensor {list(value.shape)} of {value.dtype}"
-            else:
-                return value.detach().to(target.photograph.device)
-        except (Exception, SystemExit) as error:
-            found = f"{type(error).__name__}: {error}"
-        if not self._failed:
-            self._failed = True
-            fault = _unusable(self._entry, "a real tensor [] or None from its measure", found)
-            warnings.warn(f"{fault} The metric has no value.", PolarguideWarning, stacklevel=2)
+            return self._measure(target, layers)
+        except PolarguideError as fault:
+            if not self._failed:
+                self._failed = True
+                warnings.warn(f"{fault} The metric has no value.", PolarguideWarning, stacklevel=2)
         return None
 
 
-def _unusable(entry: EntryPoint, expected: str, found: str) -> PolarguideError:
-    where = f"plug-in {entry.name} ({entry.value})"
+def _unusable(where: str, expected: str, found: str) -> PolarguideError:
     return PolarguideError(where, expected=expected, found=found, remedy=_REMEDY)

@@ -24,9 +24,9 @@ from polarguide.results.evaluation.table import (
     HIGHEST_PSNR,
     METRICS,
     OBJECT_METRICS,
+    PART_SHARES,
     PLUGGED,
     RUN_METRICS,
-    VIEW_METRICS,
 )
 
 PACKAGE = Path(__file__).parents[2]
@@ -130,7 +130,7 @@ class Provenance(TypedDict):
 _Decibels = Annotated[float, msgspec.Meta(le=HIGHEST_PSNR)] | None
 
 
-def _fields(metrics: tuple[Metric, ...], *reasons: str) -> list[Any]:
+def _fields(metrics: Sequence[Metric], *reasons: str) -> list[Any]:
     """Return the fields of a record: the metrics, and texts that explain null values."""
     values: list[Any] = []
     for metric in metrics:
@@ -150,27 +150,32 @@ _OBJECT = msgspec.defstruct(
     [
         ("pixels", int),
         ("views", int),
-        *_fields(tuple(metric for metric in METRICS if metric.key in OBJECT_METRICS)),
+        *_fields([metric for metric in METRICS if metric.key in OBJECT_METRICS]),
         ("material", str | None, None),
-        ("metal_share", float | None, None),
+        *((metric.key, float | None, None) for metric in PART_SHARES),
     ],
     kw_only=True,
 )
 """Errors over the pixels of an object or a class of material in all test views."""
 _PARTS = GenericAlias(dict, (str, _OBJECT))
-_VIEW = msgspec.defstruct("View", _fields(VIEW_METRICS, *_VIEW_REASONS))
-_RUN = msgspec.defstruct(
-    "Run",
-    [
-        *_fields(METRICS, *_RUN_REASONS),
-        ("views", Annotated[dict[str, Any], msgspec.Meta(min_length=1)]),
-        ("provenance", Provenance),
-        ("objects", _PARTS, msgspec.field(default_factory=dict)),
-        ("materials", _PARTS, msgspec.field(default_factory=dict)),
-    ],
-    kw_only=True,
-)
-"""Record in ``metrics.json``."""
+
+
+@cache
+def _structures(metrics: tuple[Metric, ...]) -> tuple[type, type]:
+    """Return the types of the scores of a view, and of the record in ``metrics.json``, for all metrics."""
+    view = msgspec.defstruct("View", _fields([m for m in metrics if m.of == "view"], *_VIEW_REASONS))
+    run = msgspec.defstruct(
+        "Run",
+        [
+            *_fields(metrics, *_RUN_REASONS),
+            ("views", Annotated[dict[str, Any], msgspec.Meta(min_length=1)]),
+            ("provenance", Provenance),
+            ("objects", _PARTS, msgspec.field(default_factory=dict)),
+            ("materials", _PARTS, msgspec.field(default_factory=dict)),
+        ],
+        kw_only=True,
+    )
+    return view, run
 
 
 def write_metrics(
@@ -244,10 +249,11 @@ def validate_metrics(record: Any, where: str | Path = METRICS_FILE) -> None:
     Raises:
         PolarguideError: the record is invalid. The error names the first invalid key.
     """
-    decode(record, _RUN, where, remedy=_REMEDY)
+    view, run = _structures(tuple(METRICS))
+    decode(record, run, where, remedy=_REMEDY)
     _check_reason(record, where)
     for name, scores in record["views"].items():
-        decode(scores, _VIEW, f"{where}, view {name}", remedy=_REMEDY)
+        decode(scores, view, f"{where}, view {name}", remedy=_REMEDY)
         _check_reason(scores, f"{where}, view {name}")
 
 

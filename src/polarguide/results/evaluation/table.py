@@ -11,7 +11,8 @@ from typing import Any, Literal
 
 from torch import Tensor
 
-from polarguide.results.evaluation.metric import Layers, Measure, Metric, plugged_metrics
+from polarguide.core.definitions import definition_digest
+from polarguide.results.evaluation.metric import Layers, Measure, Metric, checked_metric, plugged_metrics
 from polarguide.results.evaluation.metrics import (
     beyond_share,
     coverage_error,
@@ -241,22 +242,52 @@ BUILT_IN_METRICS: tuple[Metric, ...] = (
     Metric("peak_memory_mib", "peak memory", "MiB", 0, "lower", of="run", shown="record"),
 )
 """Metrics that this package defines."""
-PLUGGED = plugged_metrics({metric.key for metric in BUILT_IN_METRICS})
-"""Metrics that other installed packages define."""
-METRICS = (*BUILT_IN_METRICS, *PLUGGED)
+PLUGGED = list(plugged_metrics({metric.key for metric in BUILT_IN_METRICS}))
+"""Metrics that other installed packages define, and registered metrics."""
+REGISTERED: dict[str, tuple[Metric, str]] = {}
+"""Metrics of ``register_metric`` by key, as the user defined them, each with a digest of its definition."""
+METRICS = [*BUILT_IN_METRICS, *PLUGGED]
 """All metrics in the order of display."""
 OBJECT_METRICS = ("psnr", "normal_mae_deg", "specular_psnr", "diffuse_psnr", "stokes_error")
 """Keys of the metrics that are recorded for each object and each material."""
-VIEW_METRICS = tuple(metric for metric in METRICS if metric.of == "view")
+VIEW_METRICS = [metric for metric in METRICS if metric.of == "view"]
 """Metrics with a value for each view. A run records the mean over views."""
 RUN_METRICS = tuple(metric for metric in METRICS if metric.of == "run")
 """Metrics with one value for a run. Each value may be null."""
-COLUMNS = tuple(metric for metric in METRICS if metric.shown != "record")
+COLUMNS = [metric for metric in METRICS if metric.shown != "record"]
 """Metrics that a comparison of runs collects."""
 METAL_SHARE = Metric("metal_share", "taken for metal", "%", 1, None, factor=100.0)
 """Share of the pixels of an object with a metalness above one half, for recipes with metals."""
-PART_METRICS = (*(metric for metric in COLUMNS if metric.of == "view"), METAL_SHARE)
+UNDECIDED_SHARE = Metric("undecided_share", "undecided metal", "%", 1, None, factor=100.0)
+"""Share of the pixels of an object that are dielectrics only because of the prior, for trainings that search metals."""
+PART_SHARES = {METAL_SHARE: "metalness", UNDECIDED_SHARE: "undecided"}
+"""Layer of each share. A pixel counts if the value of the layer is above one half."""
+PART_METRICS = (*(metric for metric in COLUMNS if metric.of == "view"), *PART_SHARES)
 """Metrics of an object or of a class of material."""
+
+
+def register_metric(metric: Metric, digest: str | None = None) -> None:
+    """Add a metric of views to all scores and tables of this process. It replaces a registered metric of the same key.
+
+    Args:
+        metric: the metric.
+        digest: digest of its definition, if another process has computed it.
+
+    Raises:
+        PolarguideError: the metric is invalid, or its key belongs to another metric.
+    """
+    others = {other.key for other in METRICS} - REGISTERED.keys()
+    checked = checked_metric(metric, "metrics", others)
+    for metrics in (PLUGGED, METRICS, VIEW_METRICS, COLUMNS):
+        metrics[:] = [other for other in metrics if other.key != metric.key]
+        if metrics is not COLUMNS or metric.shown != "record":
+            metrics.append(checked)
+    REGISTERED[metric.key] = (metric, digest or definition_digest(metric))
+
+
+def registered_digests() -> dict[str, str]:
+    """Return the digest of the definition of each registered metric, by key."""
+    return {key: digest for key, (_, digest) in REGISTERED.items()}
 
 
 def shown_metrics(record: Mapping[str, Any], *, scores_only: bool = False) -> list[tuple[str, str]]:

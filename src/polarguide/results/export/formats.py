@@ -20,7 +20,6 @@ from polarguide.capture.presentation import colored
 from polarguide.core.errors import PolarguideError
 from polarguide.core.files import (
     atomic_folder,
-    holds_files,
     make_folder,
     require_inside,
     temporary_folder,
@@ -30,35 +29,31 @@ from polarguide.core.options import (
     Axes,
     ExportFormat,
     ModelOptions,
+    NormalOptions,
     PathLike,
     PlyFields,
     check_choice,
     check_finite,
 )
 from polarguide.core.progress import SILENT, Reporter
-from polarguide.optics.color import srgb_encode
 from polarguide.results.evaluation.record import METRICS_FILE, read_metrics
 from polarguide.results.evaluation.table import shown_metrics
 from polarguide.results.export.adapters import ply_fields
-from polarguide.results.export.mesh import asset_record, surface_points, write_mesh, write_points
+from polarguide.results.export.mesh import asset_record, write_mesh
 from polarguide.results.export.model.build import BASE_COLORS, Charted, charted_subject, textured_model
-from polarguide.results.export.model.gltf import write_glb, write_obj
+from polarguide.results.export.model.gltf import write_glb
 from polarguide.results.export.model.topology import subject_surface, write_stl
 from polarguide.results.export.placement import (
     GENERATOR,
-    IMAGES,
-    SUFFIX,
     Origin,
     Placement,
     Presented,
-    comments,
     rewrite_splats,
     transforms,
-    write_colmap,
-    write_transforms,
 )
 from polarguide.results.export.splats import COLOR_SPACES, Encoding, write_sog, write_splat_glb, write_spz
 from polarguide.results.export.usd import write_splat_usdz, write_usdz
+from polarguide.results.export.views import export_cameras, export_normals
 from polarguide.results.rendering.mesh import RESOLUTION, scene_mesh
 from polarguide.results.rendering.relight import (
     mirrored_light,
@@ -70,48 +65,6 @@ from polarguide.results.rendering.relight import (
 from polarguide.runs.model import write_run_ply
 from polarguide.runs.opened import OpenedRun
 from polarguide.visualization import figures
-
-TRANSFORMS = "transforms.json"
-
-
-def export_cameras(run: OpenedRun, presented: Presented, folder: Path, reporter: Reporter) -> list[Path]:
-    """Write ``sparse/0`` (COLMAP), ``transforms.json`` and the photographs in ``images/``.
-
-    The cameras are pinholes, so the images are undistorted and have the size of the cameras. They show the color of the
-    presentation (8 bits, sRGB).
-
-    Raises:
-        PolarguideError: the folder contains pictures or a model that were not exported by this program.
-    """
-    model = folder / "sparse" / "0"
-    images = folder / IMAGES
-    for place in (model, images):
-        require_inside(folder, place)
-        if place.is_dir() and holds_files(place) and not (folder / TRANSFORMS).exists():
-            raise PolarguideError(
-                place,
-                expected="an empty folder or an earlier export",
-                found="other files",
-                remedy="Choose another --out.",
-            )
-    scene = run.scene
-    placement = presented.placement
-    cameras = {name: placement.camera(camera) for name, camera in run.cameras.items()}
-    about = {**presented.origin.record(), **placement.record()}
-    # This file is written first. A repeated command recognizes an interrupted export by it.
-    write_transforms(folder / TRANSFORMS, cameras, about)
-    make_folder(images)
-    color = presented.presentation.color
-    with reporter.track("photographs", len(scene.views)) as advance:
-        for number, view in enumerate(scene.views):
-            picture = figures.radiance_to_rgb(colored(view.photograph(), color))
-            figures.write_png(images / f"{view.name}{SUFFIX}", picture)
-            advance(number + 1)
-    write_colmap(
-        model, cameras, placement.points(scene.points), scene.point_colors, comments=presented.comments
-    )
-    return [model, folder / TRANSFORMS, images]
-
 
 RECORD = "model.json"
 FILES = {
@@ -185,6 +138,7 @@ def export(
     fields: PlyFields = "release",
     axes: Axes = "upright",
     model: ModelOptions = ModelOptions(),
+    normals: NormalOptions = NormalOptions(),
     reporter: Reporter = SILENT,
 ) -> list[Path]:
     """Export a run: its subject upright, in meters, and in the color of its presentation.
@@ -193,9 +147,9 @@ def export(
         run: the run. The formats ply, spz and sog read only poses and masks of its scene.
         format: format of the file. Splats (ply, spz, sog, splat-glb, splat-usdz) have reflections baked into harmonics.
             The mesh (GLB and PLY) is fused from rendered depth and has diffuse colors and learned normals. The textured
-            model is glb, obj or usdz, and its closed surface stl. The points are opaque Gaussians with normals. The
-            environment is the learned light as a panorama (EXR, HDR and PNG). The cameras are a COLMAP model and
-            transforms.json.
+            model is glb or usdz, and its closed surface stl. The environment is the learned light as a panorama (EXR,
+            HDR and PNG). The cameras are a COLMAP model and transforms.json. The normals are poses, pictures and normal
+            maps of the training views, in a folder with the name of the layout.
         out: folder to write; default: ``export`` in the run's folder.
         resolution: number of voxels of the mesh along its longest side, 16 to 1024.
         spz_version: version of the SPZ file, 3 or 4. Most programs can read only one of the versions.
@@ -204,6 +158,7 @@ def export(
         axes: upright turns the scene so that up is +y in GLB and USD files, and -y in other files. scene keeps the axes
             of the scene, except in GLB and USD files.
         model: options of the textured model.
+        normals: options of the normal maps.
         reporter: receives the progress.
 
     Returns:
@@ -225,13 +180,20 @@ def export(
         raise PolarguideError(
             "fields", expected="release, except for --format ply", found=fields, remedy="Omit the option."
         )
+    if normals != NormalOptions() and format != "normals":
+        raise PolarguideError(
+            "layout and picture",
+            expected="the defaults, except for --format normals",
+            found=f"{normals.layout}, {normals.picture}",
+            remedy="Omit these options.",
+        )
     # The number of Gaussians matters only for formats with Gaussians.
-    listener = SILENT if format in ("environment", "cameras") else reporter
+    listener = SILENT if format in ("environment", "cameras", "normals") else reporter
     presented = Presented(run, axes=axes, masked=model.masked, reporter=listener)
     make_folder(folder)
     with reporter.track(f"writing {format}", None):
         return _WRITERS[format](
-            _Exporter(run, presented, folder, resolution, spz_version, fields, model, reporter)
+            _Exporter(run, presented, folder, resolution, spz_version, fields, model, normals, reporter)
         )
 
 
@@ -246,6 +208,7 @@ class _Exporter:
     spz_version: int
     fields: PlyFields
     options: ModelOptions
+    normal_options: NormalOptions
     reporter: Reporter
 
     def plys(self) -> list[Path]:
@@ -351,10 +314,6 @@ class _Exporter:
             self.run, subject, presented.presentation, placement, options, self.reporter
         )
         meaning = BASE_COLORS[options.resolved_base_color]
-        if kind == "obj":
-            upright = replace(placement, upright=False)  # The file is always +y up.
-            lines = [*comments(presented.origin, upright), "up_axis +y", f"base_color {meaning}"]
-            return write_obj(self.folder, textured, lines, jpeg=options.jpeg)
         asset = asset_record(placement, presented.origin)
         asset["extras"]["base_color"] = meaning
         path = self.folder / f"model{'-unlit' if options.unlit else ''}.{kind}"
@@ -416,19 +375,6 @@ class _Exporter:
             write_text(parts / RECORD, json.dumps({**record, "files": about_files(names)}, indent=1) + "\n")
         return [self.folder / name for name in [RECORD, *names]]
 
-    def points(self) -> list[Path]:
-        path = self.folder / "points.ply"
-        model = self.run.model
-        presented = self.presented
-        placement = presented.placement
-        means, normals, linear = surface_points(
-            presented.gaussians, model.shading, self.run.scene.views, model.backend.rasterize
-        )
-        colors = srgb_encode(colored(linear, presented.presentation.color).clamp(0, 1))
-        points = placement.points(means)
-        write_points(path, points, placement.directions(normals), colors, presented.comments)
-        return [path]
-
     def environment(self) -> list[Path]:
         run = self.run
         presentation = self.presented.presentation
@@ -445,6 +391,12 @@ class _Exporter:
     def cameras(self) -> list[Path]:
         return export_cameras(self.run, self.presented, self.folder, self.reporter)
 
+    def normals(self) -> list[Path]:
+        folder = self.folder / self.normal_options.layout
+        require_inside(self.folder, folder)
+        make_folder(folder)
+        return export_normals(self.run, self.presented, folder, self.normal_options, self.reporter)
+
 
 _WRITERS: dict[str, Callable[[_Exporter], list[Path]]] = {
     "ply": _Exporter.plys,
@@ -453,10 +405,10 @@ _WRITERS: dict[str, Callable[[_Exporter], list[Path]]] = {
     "splat-glb": _Exporter.splat_glbs,
     "splat-usdz": _Exporter.splat_usdz,
     "mesh": _Exporter.mesh,
-    **{kind: partial(_Exporter.model, kind=kind) for kind in ("glb", "obj", "usdz")},
+    **{kind: partial(_Exporter.model, kind=kind) for kind in ("glb", "usdz")},
     "stl": _Exporter.stl,
-    "points": _Exporter.points,
     "environment": _Exporter.environment,
     "cameras": _Exporter.cameras,
+    "normals": _Exporter.normals,
     "all": _Exporter.all,
 }

@@ -1,8 +1,8 @@
-"""Export of a scene's surface: a triangle mesh, and a point cloud with normals."""
+"""Export of a scene's surface as a triangle mesh, and of points."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,14 +13,9 @@ from numpy.typing import NDArray
 from plyfile import PlyData, PlyElement
 from torch import Tensor
 
-from polarguide.capture import View
-from polarguide.core.errors import PolarguideError
 from polarguide.core.files import atomic
-from polarguide.gaussians.gaussians import CORE_SHAPES
-from polarguide.gaussians.geometry import shortest_axis_normals
 from polarguide.geometry.scene_frame import SceneFrame
 from polarguide.optics.color import srgb_encode
-from polarguide.raster import Rasterize
 from polarguide.results.export.model.gltf import ELEMENTS, Binary
 from polarguide.results.export.placement import (
     GENERATOR,
@@ -31,9 +26,6 @@ from polarguide.results.export.placement import (
     comments,
 )
 from polarguide.results.rendering.mesh import ColoredMesh
-from polarguide.shading.gbuffer import diffuse_colors
-from polarguide.shading.model import Parameters, ShadingModel
-from polarguide.training.callbacks import outward_directions
 
 
 def write_mesh(
@@ -74,6 +66,34 @@ def write_mesh(
     write_points(path, points, normals, colors, comments(origin, placement), surface.faces)
 
 
+def write_points(
+    path: Path,
+    points: Tensor,
+    normals: Tensor,
+    colors: Tensor,
+    remarks: Sequence[str],
+    faces: NDArray[np.integer[Any]] | None = None,
+) -> None:
+    """Write points, and optionally the triangles between them, as a PLY file.
+
+    Args:
+        path: the file.
+        points: [N, 3] positions.
+        normals: [N, 3] unit normals; zero if unknown.
+        colors: [N, 3] sRGB colors in [0, 1].
+        remarks: comments of the file.
+        faces: [F, 3] indices of the points of each triangle.
+    """
+    values = np.concatenate((points.numpy(), normals.numpy(), np.rint(colors.numpy() * 255)), axis=1)
+    table = unstructured_to_structured(values, np.dtype(FIELDS))
+    elements = [PlyElement.describe(table, "vertex", comments=list(remarks))]
+    if faces is not None:
+        rows = faces.astype("<i4").view([("vertex_indices", "<i4", (3,))])[:, 0]
+        elements.append(PlyElement.describe(rows, "face"))
+    with atomic(path) as temporary:
+        PlyData(elements, byte_order="<").write(temporary)
+
+
 def asset_record(placement: Placement, origin: Origin) -> dict[str, Any]:
     """Return the asset record of a glTF file.
 
@@ -90,67 +110,6 @@ def asset_record(placement: Placement, origin: Origin) -> dict[str, Any]:
 
 DIELECTRIC = {"metallicFactor": 0.0, "roughnessFactor": 1.0}
 """glTF material that shows vertex colors as a diffuse surface."""
-OPAQUE = 0.5
-"""Minimum opacity of a Gaussian that belongs to a surface."""
 FIELDS = [(name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")] + [
     (name, "u1") for name in ("red", "green", "blue")
 ]
-
-
-@torch.no_grad()
-def surface_points(
-    gaussians: Parameters,
-    shading: ShadingModel,
-    views: Iterable[View],
-    rasterize: Rasterize,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Return positions, outward unit normals and linear diffuse colors of visible opaque Gaussians, each [M, 3].
-
-    Raises:
-        PolarguideError: no opaque Gaussian is visible in any view.
-    """
-    outward = outward_directions(gaussians, views, rasterize)
-    opaque = torch.sigmoid(gaussians["opacity_logits"]) >= OPAQUE
-    indices = (opaque & (outward.norm(dim=1) > 0)).nonzero()[:, 0]
-    if not len(indices):
-        raise PolarguideError(
-            "--format points",
-            expected="opaque Gaussians that are visible in a view",
-            found="none",
-            remedy="Train for more steps.",
-        )
-    means = gaussians["means"][indices]
-    side = outward[indices]
-    normals = shortest_axis_normals(
-        means, gaussians["quaternions"][indices], gaussians["log_scales"][indices], torch.zeros(3)
-    )
-    normals = torch.where((normals * side).sum(dim=1, keepdim=True) < 0, -normals, normals)
-    selected = {name: gaussians[name][indices] for name in (*CORE_SHAPES, *shading.parameters)}
-    return means, normals, diffuse_colors(selected, shading, -normals.contiguous())
-
-
-def write_points(
-    path: Path,
-    points: Tensor,
-    normals: Tensor,
-    colors: Tensor,
-    comments: Sequence[str] = (),
-    faces: NDArray[np.int64] | None = None,
-) -> None:
-    """Write a PLY file of points, or of a mesh, with comments.
-
-    Args:
-        path: the file.
-        points, normals: [M, 3].
-        colors: [M, 3] encoded, in [0, 1].
-        comments: comment lines of the header.
-        faces: [F, 3] of a mesh; None for a point cloud.
-    """
-    values = np.concatenate((points.numpy(), normals.numpy(), np.rint(colors.numpy() * 255)), axis=1)
-    table = unstructured_to_structured(values, np.dtype(FIELDS))
-    elements = [PlyElement.describe(table, "vertex", comments=list(comments))]
-    if faces is not None:
-        rows = faces.astype("<i4").view([("vertex_indices", "<i4", (3,))])[:, 0]
-        elements.append(PlyElement.describe(rows, "face"))
-    with atomic(path) as temporary:
-        PlyData(elements, byte_order="<").write(temporary)

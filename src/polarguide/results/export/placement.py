@@ -267,8 +267,13 @@ def _require_complete(folder: Path, images: int, points: int) -> None:
         raise OSError("a truncated file; the disk may be full")
 
 
-def transforms(cameras: Mapping[str, Camera]) -> dict[str, Any]:
-    """Return the record of ``transforms.json``: intrinsics and camera-to-world matrices in OpenGL axes."""
+def transforms(cameras: Mapping[str, Camera], masks: str = "") -> dict[str, Any]:
+    """Return the record of ``transforms.json``: intrinsics and camera-to-world matrices in OpenGL axes.
+
+    Args:
+        cameras: cameras by view.
+        masks: folder of the masks of the views; empty without masks.
+    """
     frames = []
     for name, camera in cameras.items():
         pose = torch.eye(4, dtype=torch.float64)
@@ -283,20 +288,24 @@ def transforms(cameras: Mapping[str, Camera]) -> dict[str, Any]:
                 "w": camera.width,
                 "h": camera.height,
                 "transform_matrix": (pose @ _OPENGL).tolist(),
+                **({"mask_path": f"{masks}/{name}{SUFFIX}"} if masks else {}),
             }
         )
     return {"camera_model": "OPENCV", "frames": frames}
 
 
-def write_transforms(path: Path, cameras: Mapping[str, Camera], about: Mapping[str, Any] = {}) -> None:
+def write_transforms(
+    path: Path, cameras: Mapping[str, Camera], about: Mapping[str, Any] = {}, *, masks: str = ""
+) -> None:
     """Write ``transforms.json``.
 
     Args:
         path: the file.
         cameras: cameras by view.
-        about: additional fields, which other programs ignore.
+        about: additional fields. Other programs ignore fields that they do not know.
+        masks: see ``transforms``.
     """
-    write_text(path, json.dumps({**transforms(cameras), **about}, indent=1) + "\n")
+    write_text(path, json.dumps({**transforms(cameras, masks), **about}, indent=1) + "\n")
 
 
 ALL = Subject(None, "everything")

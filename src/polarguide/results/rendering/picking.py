@@ -1,4 +1,4 @@
-"""Surface and color at a pixel that the user picks, and white balance from such a color."""
+"""Surface or color at a pixel that the user specifies, and white balance from such a color."""
 
 from __future__ import annotations
 
@@ -26,17 +26,15 @@ PATCH = 2  # radius in pixels over which a picked color is averaged
 
 @dataclass(frozen=True, eq=False)
 class SurfacePoint:
-    """Surface point at a picked pixel.
+    """Surface point at a specified pixel.
 
     Attributes:
         point: [3] float64 in the world.
         normal: [3] float64 unit vector toward the camera, or None if unknown.
-        color: [3] linear radiance of the final layer around the point.
     """
 
     point: Tensor
     normal: Tensor | None
-    color: Tensor
 
 
 def surface_at(result: RenderResult, camera: Camera, x: float, y: float) -> SurfacePoint | None:
@@ -64,8 +62,7 @@ def surface_at(result: RenderResult, camera: Camera, x: float, y: float) -> Surf
         if float(blended.norm()) > 0.1:
             normal = unit(blended, 1e-9)
             normal = -normal if float(normal @ ray) > 0 else normal
-    color = _patch(result.final, row, column).mean(dim=(0, 1))
-    return SurfacePoint(camera.center + depth * ray, normal, color)
+    return SurfacePoint(camera.center + depth * ray, normal)
 
 
 def photograph_color(view: View, x: float, y: float) -> Tensor:

@@ -358,7 +358,7 @@ class _PresentedFolder:
                 where,
                 expected=f"a surface at a place in {name}, which is {camera.width} x {camera.height}",
                 found=f"none at {x:g},{y:g}",
-                remedy="Pick a place on an object in polarguide view.",
+                remedy="Specify a place on an object.",
             )
         return hit.point, hit.normal
 

@@ -107,7 +107,6 @@ class AngleFits(Callback[TrainingLoop]):
             return context.shading.predicted_stokes(result, view.camera)
 
         table = self.polarizers.fit(predicted).to(context.backend.device)
-        loop.ranks.broadcast(table)
         earlier = [] if state.angles is None else [*state.angles]
         state.angles = torch.stack([*earlier, table.cpu()])
         changed = self.polarizers.take(state.angles)

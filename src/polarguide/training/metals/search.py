@@ -432,8 +432,6 @@ class MetalSearch:
         priors = self._priors(state.step)
         metal = decide(measured, gaussians, self._allowed(state), context.recipe.metal_rules, priors)
         reflectance = measured.reflectance
-        for values in (metal, reflectance):
-            context.ranks.broadcast(values)
         determined = [view for view in views if view.is_determined]
         gain = partial(
             light_gain, gaussians, state.light, determined, rasterize, context.shading, limits, context.memory

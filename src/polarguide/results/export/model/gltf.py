@@ -1,7 +1,4 @@
-"""Export of a textured mesh as a binary glTF 2.0 file, or as Wavefront OBJ with material and textures.
-
-Roughness and metalness of OBJ are in the fields ``map_Pr`` and ``map_Pm`` of Clara.io's extension, which Blender reads.
-"""
+"""Export of a textured mesh as a binary glTF 2.0 file."""
 
 from __future__ import annotations
 
@@ -17,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from polarguide.core.files import atomic_folder, write_whole
+from polarguide.core.files import write_whole
 from polarguide.optics.color import srgb_encode_array
 from polarguide.shading.surface import GltfTexture
 
@@ -205,51 +202,3 @@ def _material(model: Textured, *, jpeg: bool) -> tuple[list[tuple[str, bytes]], 
         extension |= {**place.constants, place.texture: {"index": len(images)}}
         images.append(encoded(pixels, jpeg=False))
     return images, {**material, "extensions": extensions}, [*extensions]
-
-
-NAME = "model"
-_GRAY = 3
-
-
-def write_obj(folder: Path, model: Textured, lines: Sequence[str], *, jpeg: bool) -> list[Path]:
-    """Write ``model.obj``, ``model.mtl`` and the textures ``model-color``, ``model-roughness`` and ``model-metalness``.
-
-    Args:
-        folder: folder to write.
-        model: the mesh.
-        lines: comments.
-        jpeg: encode the color as JPEG instead of PNG.
-
-    Raises:
-        PolarguideError: a file cannot be written.
-    """
-    pictures: dict[str, Pixels] = {"color": model.base_color}
-    if model.surface is not None:
-        for channel, name in ((1, "roughness"), (2, "metalness")):
-            pictures[name] = np.repeat(model.surface[..., channel, None], _GRAY, axis=2)
-    names = {name: f"{NAME}-{name}.{'jpg' if jpeg and name == 'color' else 'png'}" for name in pictures}
-    head = "".join(f"# {line}\n" for line in lines)
-    with atomic_folder(folder) as temporary:
-        for name, pixels in pictures.items():
-            (temporary / names[name]).write_bytes(encoded(pixels, jpeg=jpeg and name == "color")[1])
-        (temporary / f"{NAME}.mtl").write_text(head + _obj_material(names, model), encoding="ascii")
-        (temporary / f"{NAME}.obj").write_text(head + _geometry(model), encoding="ascii")
-    return [folder / f"{NAME}.obj", folder / f"{NAME}.mtl", *(folder / name for name in names.values())]
-
-
-def _obj_material(names: dict[str, str], model: Textured) -> str:
-    lit = "roughness" in names
-    lines = ["newmtl surface", "Kd 1 1 1", f"map_Kd {names['color']}"]
-    if lit:
-        lines += [f"Ni {model.index:g}", f"map_Pr {names['roughness']}", f"map_Pm {names['metalness']}"]
-    return "\n".join([*lines, f"illum {2 if lit else 0}"]) + "\n"  # 0 means constant color.
-
-
-def _geometry(model: Textured) -> str:
-    uv = np.stack([model.uv[:, 0], 1 - model.uv[:, 1]], axis=1)  # In OBJ v starts at the last row.
-    numbers = model.faces + 1
-    lines = [f"mtllib {NAME}.mtl", "usemtl surface"]
-    for word, values in (("v", model.vertices), ("vt", uv), ("vn", model.normals)):
-        lines += [f"{word} {' '.join(f'{number:.7g}' for number in row)}" for row in values.tolist()]
-    lines += [f"f {a}/{a}/{a} {b}/{b}/{b} {c}/{c}/{c}" for a, b, c in numbers.tolist()]
-    return "\n".join(lines) + "\n"
