@@ -47,6 +47,8 @@ FOREIGN_OPTIONS = {
         "nthreads",
         "gres",
         "me",
+        *("normal-loss-weight", "normal-format", "load-depths", "pipeline"),
+        *("tag", "rm", "volume", "user"),
     ),
 }
 BRITISH = re.compile(
