@@ -20,9 +20,9 @@ from polarguide.core.text import csv_value, printable
 from polarguide.results.evaluation.table import (
     COLUMNS,
     MESH_LABEL,
-    METAL_SHARE,
     METRICS,
     PART_METRICS,
+    PART_SHARES,
     Metric,
 )
 from polarguide.visualization.pages import templates
@@ -489,7 +489,7 @@ def csv_text(frame: pd.DataFrame) -> str:
     """
     frame = frame.copy()
     names = {}
-    for metric in (metric for metric in (*METRICS, METAL_SHARE) if metric.factor != 1):
+    for metric in (metric for metric in (*METRICS, *PART_SHARES) if metric.factor != 1):
         unit = "percent" if metric.unit == "%" else metric.unit
         for suffix in ("", "_spread"):
             key = metric.key + suffix

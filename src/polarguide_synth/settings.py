@@ -129,7 +129,7 @@ def rough_time(seconds: float) -> str:
 PRESETS = (
     *("figure", "kit", "car", "cup", "water"),
     *("metals-a", "metals-b", "ceramic-a", "ceramic-b", "rough", "lacquer"),
-    *("glossy", "proof"),
+    *("alloys", "frame", "glossy", "proof"),
 )
 """Names of the scenes that are part of the package."""
 TEST_EVERY = 8

@@ -47,8 +47,14 @@ FOREIGN_OPTIONS = {
         "nthreads",
         "gres",
         "me",
-        *("normal-loss-weight", "normal-format", "load-depths", "pipeline"),
-        *("tag", "rm", "volume", "user"),
+        "tag",
+        "rm",
+        "volume",
+        "user",
+        "load-depths",
+        "normal-format",
+        "normal-loss-weight",
+        "pipeline",
     ),
 }
 BRITISH = re.compile(

@@ -142,15 +142,18 @@ def _errors(record: dict[str, Any], columns: list[Any]) -> Table:
     table.add_column("pixels", justify="right", no_wrap=True)
     for metric in columns:
         table.add_column(metric.heading, justify="right", min_width=8)
-    has_metals = any(errors.get("metal_share") is not None for errors in record["objects"].values())
-    if has_metals:
-        table.add_column("metal", justify="right", no_wrap=True)
+    headings = {"metal_share": "metal", "undecided_share": "undecided"}
+    shares = [
+        key for key in headings if any(errors.get(key) is not None for errors in record["objects"].values())
+    ]
+    for key in shares:
+        table.add_column(headings[key], justify="right", no_wrap=True)
 
     def add(name: str, errors: dict[str, Any]) -> None:
         values = [errors[metric.key] for metric in columns]
         texts = ["n/a" if v is None else f"{v:.{m.digits}f}" for m, v in zip(columns, values, strict=True)]
-        share = errors.get("metal_share")
-        texts += ["n/a" if share is None else f"{100 * share:.1f} %"] if has_metals else []
+        values = [errors.get(key) for key in shares]
+        texts += ["n/a" if share is None else f"{100 * share:.1f} %" for share in values]
         table.add_row(Text(printable(name)), f"{errors['pixels']:,}", *texts)
 
     largest = sorted(record["objects"], key=lambda name: -record["objects"][name]["pixels"])[:_MOST_OBJECTS]

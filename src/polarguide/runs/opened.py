@@ -28,6 +28,9 @@ from polarguide.runs.folder import CONFIGURATION, RunConfiguration, load_checkpo
 from polarguide.runs.health import Health
 from polarguide.runs.model import GaussianModel, Within
 from polarguide.shading.result import LAYERS, POLARIZED, RenderResult, polarized_layers
+from polarguide.training.context import TrainingContext
+from polarguide.training.metals.observations import blended
+from polarguide.training.metals.search import MetalSearch
 from polarguide.training.recipe import Recipe, values_differ
 from polarguide.training.settings import ResolvedSettings, TrainSettings
 
@@ -307,6 +310,23 @@ class OpenedRun:
     def cameras(self) -> dict[str, Camera]:
         """Cameras of the scene's views by name. The scene is read on first use."""
         return {view.name: view.camera for view in self.scene.views}
+
+    @cached_property
+    def _possible_metals(self) -> Tensor | None:
+        """Mask [N] of the Gaussians that are dielectrics only because of the prior, see ``MetalSearch.undecided``."""
+        context = TrainingContext(self.scene, self.recipe, self.configuration.settings, self.model.backend)
+        return MetalSearch(context).undecided(self.model.state)
+
+    def undecided(self, camera: Camera) -> Tensor | None:
+        """Render the share [H, W] of surfaces that are dielectrics only because of the prior of metals.
+
+        The first call measures all training views, so the scene is read. The result is None if the training did not
+        search for metals, or if no view determines the Stokes vector.
+        """
+        possible = self._possible_metals
+        if possible is None:
+            return None
+        return blended(self.model.state.gaussians, possible.float(), camera, self.model.backend.rasterize)
 
     @property
     def layers(self) -> tuple[str, ...]:

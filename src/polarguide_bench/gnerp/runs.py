@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from polarguide.capture import Scene
 from polarguide.core.errors import require
@@ -108,6 +109,9 @@ class FieldRun:
     def cameras(self) -> dict[str, Camera]:
         """Cameras of the scene's views by name."""
         return {view.name: view.camera for view in self.scene.views}
+
+    def undecided(self, camera: Camera) -> Tensor | None:
+        """Return None, because a field has no metals."""
 
     def surface(self) -> Surface:
         """Extract the surface, which is the zero set of the signed distance, for scores of the mesh.

@@ -82,7 +82,7 @@ CPU = torch.device("cpu")
 SEEDS = (5, 6)
 
 
-def errors(scene, *, layers=True, metal=None):
+def errors(scene, *, layers=True, **more):
     facts = SceneFacts.of(scene)
     pool = ErrorsByObject(facts.objects)
     for view, seed in zip(scene.views, SEEDS, strict=True):
@@ -90,8 +90,7 @@ def errors(scene, *, layers=True, metal=None):
         if not layers:
             stokes = None
             del result.layers["specular"], result.layers["diffuse"]
-        if metal is not None:
-            result.layers["metalness"] = metal(view)
+        result.layers.update({name: layer(view) for name, layer in more.items()})
         score_view(ViewTarget.of_view(view, facts, CPU), result, stokes=stokes, by_object=pool)
     return pool.records()
 
@@ -196,12 +195,14 @@ def test_views_without_numbers_add_nothing():
     assert errors(dataclasses.replace(SCENE, views=bare)) == ({}, {})
 
 
-def test_shares_of_what_is_shown_as_metal() -> None:
+@pytest.mark.parametrize(("layer", "share"), [("metalness", "metal_share"), ("undecided", "undecided_share")])
+def test_shares_of_metals_and_of_undecided_surfaces(layer: str, share: str) -> None:
     spoon = next(item.id for item in SCENE.objects if item.name == "spoon")
     by_object, materials = errors(
-        SCENE, metal=lambda view: 0.4 + 0.2 * (view.ground_truth.object_ids == spoon)
+        SCENE, **{layer: lambda view: 0.4 + 0.2 * (view.ground_truth.object_ids == spoon)}
     )
-    shares = {name: found["metal_share"] for name, found in by_object.items()}
+    shares = {name: found[share] for name, found in by_object.items()}
     assert shares == {"cup": 0, "spoon": 1, "cloth": 0, "clay": 0}
-    assert materials["metal"]["metal_share"] == 1
-    assert "metal_share" not in errors(SCENE)[0]["cup"]
+    assert materials["metal"][share] == 1
+    assert {"metal_share", "undecided_share"} & by_object["cup"].keys() == {share}
+    assert share not in errors(SCENE)[0]["cup"]

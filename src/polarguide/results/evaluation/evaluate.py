@@ -324,6 +324,9 @@ class ScoredRun(Protocol):
     def cameras(self) -> dict[str, Camera]:
         """Cameras of the scene's views by name."""
 
+    def undecided(self, camera: Camera) -> Tensor | None:
+        """Render the share [H, W] of possible metals; return None if the training did not search for metals."""
+
 
 def evaluate(
     run: ScoredRun,
@@ -448,6 +451,9 @@ def _score(
     in_front = None
     if target.depth is not None:
         in_front = run.model.alpha_in_front(view.camera, HAZE_DEPTH * target.depth)
+    undecided = None if target.owner is None else run.undecided(view.camera)
+    if undecided is not None:
+        result = result.with_layers(undecided=undecided)
     sheet.add(view, target, result, stokes)
     return score_view(target, result, stokes=stokes, in_front=in_front, by_object=by_object)
 

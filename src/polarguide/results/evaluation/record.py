@@ -24,6 +24,7 @@ from polarguide.results.evaluation.table import (
     HIGHEST_PSNR,
     METRICS,
     OBJECT_METRICS,
+    PART_SHARES,
     PLUGGED,
     RUN_METRICS,
 )
@@ -151,7 +152,7 @@ _OBJECT = msgspec.defstruct(
         ("views", int),
         *_fields([metric for metric in METRICS if metric.key in OBJECT_METRICS]),
         ("material", str | None, None),
-        ("metal_share", float | None, None),
+        *((metric.key, float | None, None) for metric in PART_SHARES),
     ],
     kw_only=True,
 )

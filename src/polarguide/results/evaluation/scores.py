@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -13,7 +13,13 @@ from polarguide.capture.metadata import SceneObject
 from polarguide.optics.color import shown
 from polarguide.results.evaluation.metrics import LEAST_POLARIZED, Selection, decibels, normal_angles_deg
 from polarguide.results.evaluation.perceptual import flip, lpips
-from polarguide.results.evaluation.table import HIGHEST_PSNR, OBJECT_METRICS, VIEW_METRICS, Layers
+from polarguide.results.evaluation.table import (
+    HIGHEST_PSNR,
+    OBJECT_METRICS,
+    PART_SHARES,
+    VIEW_METRICS,
+    Layers,
+)
 from polarguide.results.evaluation.target import ViewTarget
 from polarguide.shading.result import RenderResult
 
@@ -80,7 +86,7 @@ class ErrorsByObject:
             [[item.material.kind == kind for item in objects] for kind in self._kinds], dtype=torch.float64
         ).reshape(len(self._kinds), len(self._objects))
         self._sums: Tensor | None = None
-        self._has_metals = False
+        self._shares: list[str] = []
 
     def add(self, target: ViewTarget, layers: Layers) -> None:
         """Add the errors of a view. A view without a map of objects adds no error."""
@@ -92,10 +98,12 @@ class ErrorsByObject:
         nothing = torch.zeros_like(target.photograph[..., 0])
         lit = nothing if target.polarized is None else 2 * target.photograph.sum(-1) * target.polarized.mask
         columns = [values for key in OBJECT_METRICS for values in maps.get(key, (nothing, nothing))]
-        metalness = layers.get("metalness")
-        self._has_metals = metalness is not None
-        metal = nothing if metalness is None else (metalness > HALF).to(torch.float64)
-        columns += [metal, lit, counts.to(torch.float64)]
+        shares = {metric.key: layers.get(layer) for metric, layer in PART_SHARES.items()}
+        self._shares = [key for key, values in shares.items() if values is not None]
+        columns += [
+            nothing if values is None else (values > HALF).to(torch.float64) for values in shares.values()
+        ]
+        columns += [lit, counts.to(torch.float64)]
         table = torch.stack(columns, dim=-1).flatten(0, 1) * counts.flatten()[:, None]
         sums = torch.stack(
             [(owner.flatten() == place).to(table.dtype) @ table for place in range(len(self._objects))]
@@ -111,7 +119,7 @@ class ErrorsByObject:
         """
         if self._sums is None:
             return {}, {}
-        rows = [_record(row, metals=self._has_metals) for row in self._sums.cpu().tolist()]
+        rows = [_record(row, self._shares) for row in self._sums.cpu().tolist()]
         count = len(self._objects)
         by_object = {
             item.name: {"material": item.material.kind, **row}
@@ -120,8 +128,10 @@ class ErrorsByObject:
         return by_object, dict(zip(self._kinds, rows[count:], strict=True))
 
 
-def _record(sums: Sequence[float], *, metals: bool) -> dict[str, Any]:
-    *pairs, metal, light, pixels, views = sums
+def _record(sums: Sequence[float], measured: Collection[str]) -> dict[str, Any]:
+    *sums, light, pixels, views = sums
+    pairs = sums[: 2 * len(OBJECT_METRICS)]
+    shares = sums[2 * len(OBJECT_METRICS) :]
     record: dict[str, Any] = {"pixels": int(pixels), "views": int(views)}
     for key, error, weight in zip(OBJECT_METRICS, pairs[::2], pairs[1::2], strict=True):
         counted = weight > 0 and (key != "stokes_error" or weight >= LEAST_POLARIZED * light)
@@ -129,8 +139,9 @@ def _record(sums: Sequence[float], *, metals: bool) -> dict[str, Any]:
         if value is not None and key.endswith("psnr"):
             value = min(decibels(value), HIGHEST_PSNR)
         record[key] = value
-    if metals and pixels:
-        record["metal_share"] = metal / pixels
+    for metric, count in zip(PART_SHARES, shares, strict=True):
+        if metric.key in measured and pixels:
+            record[metric.key] = count / pixels
     return record
 
 
@@ -175,7 +186,7 @@ def score_view(
     Raises:
         ValueError: the shapes do not match.
     """
-    names = ("final", "normal", "specular", "diffuse", "depth", "alpha", "metalness")
+    names = ("final", "normal", "specular", "diffuse", "depth", "alpha", *PART_SHARES.values())
     layers = {name: _detached(rendered.layers.get(name)) for name in names}
     layers["polarization"] = None if stokes is None else _detached(stokes[1:].movedim(0, 2).flatten(2))
     layers["in_front"] = _detached(in_front)
