@@ -98,7 +98,7 @@ def api_pages(docs: Path) -> dict[str, str]:
     index = [
         "# The library, room by room",
         "",
-        "| room | what is in it |",
+        "| room | content |",
         "|---|---|",
         *lines,
         "",
@@ -128,7 +128,9 @@ def public_names() -> str:
             more = "   :inherited-members:\n" if inherits else ""
             directives.append(f".. autoclass:: {place}\n   :members:\n{more}")
         elif callable(value):
-            directives.append(f".. autofunction:: {place}\n")
+            # A module of the same name, such as polarguide.recipes, keeps its entry in the index.
+            more = "   :no-index:\n" if exists(place) else ""
+            directives.append(f".. autofunction:: {place}\n{more}")
         elif not inspect.ismodule(value):
             directives.append(f".. autodata:: {place}\n")
     return "```{eval-rst}\n" + "\n".join(directives) + "```\n"
