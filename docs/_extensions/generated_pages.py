@@ -98,7 +98,7 @@ def api_pages(docs: Path) -> dict[str, str]:
     index = [
         "# The library, room by room",
         "",
-        "| room | what is in it |",
+        "| room | content |",
         "|---|---|",
         *lines,
         "",
