@@ -248,7 +248,7 @@ def test_the_shell_is_near_without_measured_stokes_vectors(tiny_scene: Scene) ->
     distances = []
     for scene in (tiny_scene, glossy_table()):
         trainer = make_trainer(scene, RECIPES["polarguide-stokes"], 10, seed=0)
-        means = trainer.state.gaussians["means"][-100:]
+        means = trainer.state.gaussians["means"].detach()[-100:]
         distances.append(float((means - trainer.context.middle).norm(dim=1).median()) / trainer.context.reach)
     assert distances[0] > 50
     assert 3 < distances[1] < 12
