@@ -269,5 +269,5 @@ RECIPE_POLGS = Recipe(
         environment_rate=0.01,
         environment_resolution=32,
     ),
-    priors=Priors(bright=1e-3),
+    priors=Priors(bright=1e-3),  # normals and depth agree in all pixels that are not black
 )

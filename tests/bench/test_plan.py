@@ -273,7 +273,7 @@ def test_a_comparison_and_an_ablation_share_runs(
 @pytest.mark.parametrize(
     ("scenes", "recipes", "more", "fault"),
     [
-        (["demo"], [replace(recipe_named("3dgs"), ssim_weight=0.3)], {}, Fault("recipes", "registered")),
+        (["demo"], [replace(recipe_named("3dgs"), ssim_weight=0.3)], {}, Fault("recipe 3dgs", "no other")),
         (
             ["demo"],
             ["3dgs"],

@@ -218,6 +218,7 @@ ELSEWHERE = {
         for verb in ("compare", "ablate")
         for name in ("seed", "views_per_step", "gaussians", "begin_again", "materials")
     ),
+    ("train", "begin_again"),
     ("prepare", "calibration"),
     ("prepare", "analyzers"),
     ("measure", "calibration"),

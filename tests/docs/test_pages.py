@@ -47,6 +47,14 @@ FOREIGN_OPTIONS = {
         "nthreads",
         "gres",
         "me",
+        "tag",
+        "rm",
+        "volume",
+        "user",
+        "load-depths",
+        "normal-format",
+        "normal-loss-weight",
+        "pipeline",
     ),
 }
 BRITISH = re.compile(

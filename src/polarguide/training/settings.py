@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
 import tyro
 
@@ -68,7 +68,7 @@ class TrainSettings:
     background: Background = "auto"
     gaussians: int | None = None
     exposures: Exposures = "captured"
-    begin_again: tyro.conf.Fixed[bool] = True
+    begin_again: Annotated[bool, tyro.conf.Fixed, tyro.conf.Suppress] = True
     materials: Materials = "auto"
 
     def __post_init__(self) -> None:
