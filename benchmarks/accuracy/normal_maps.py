@@ -1,8 +1,8 @@
 """Train 3dgs with a normal loss on exported normal maps, as another trainer would.
 
 The folder is an export with ``--format normals --layout brush``. For the rendered normal n and the normal m of the map,
-both unit vectors, the loss is the mean of ``|n - m|_1 + 1 - n . m`` over the decided pixels. Brush has the same loss;
-its guide uses the weight 0.05.
+both unit vectors, the loss is the mean of ``|n - m|_1 + 1 - n . m`` over the decided pixels, in all steps. It follows
+the loss of Brush, whose guide has the weight 0.05. Brush does not normalize n and begins after a sixth of the steps.
 
     polarguide export RUN --format normals --layout brush --out FOLDER
     python benchmarks/accuracy/normal_maps.py SCENE FOLDER/brush OUT [--weight 0.05] [--downscale 2] [--steps 1500]

@@ -51,6 +51,8 @@ EXCLUDED = {
     "python3 -m venv .venv '&&' . .venv/bin/activate": "leaves the environment in which all others run here",
     "pip install uv": "another installer",
     "uv pip install --torch-backend=cpu .": "leaves the environment in which all others run here",
+    "docker build --tag polarguide .": "needs Docker",
+    "docker run --rm --volume '$PWD:/data' --user '$(id -u)' polarguide train SCENE --out runs/mine": "needs Docker",
 }
 SERVER = Path(__file__).with_name("served_commands.py")
 STEPS = 120  # after so many the relief has a surface, of which a mesh can be made

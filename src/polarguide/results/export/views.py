@@ -1,6 +1,6 @@
 """Export of posed pictures and normal maps for other trainers.
 
-The rules of the readers of normal maps, with their sources, are in ``docs/how-to/export.md``.
+The rules of the readers of normal maps, with their sources, are in ``docs/how-to/normal-maps.md``.
 """
 
 from __future__ import annotations
