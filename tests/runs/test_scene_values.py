@@ -17,7 +17,7 @@ from polarguide.capture.scene import chosen_views, far_from_training
 from polarguide.core.options import SceneOptions
 from polarguide.core.progress import Reporter
 from polarguide.core.system import MemoryBound
-from polarguide.recipes import recipe_named
+from polarguide.recipes import RECIPES, recipe_named
 from polarguide.runs import callbacks as observers
 from polarguide.runs import train as training
 from polarguide.runs.callbacks import TrainingStopped
@@ -25,6 +25,7 @@ from polarguide.runs.folder import CONFIGURATION
 from polarguide.training.recipe import Schedule
 from polarguide.training.settings import TrainSettings
 from polarguide_bench.options import CompareOptions
+from polarguide_bench.plan import Comparison, plan_runs, scene_entries
 
 READING = SceneOptions(downscale=4)
 ASKED = TrainSettings(3)
@@ -76,11 +77,12 @@ def test_without_settings_it_is_that_of_the_scene(water: Path, tmp_path: Path) -
 
 
 def test_a_comparison_takes_it_too(water: Path, tmp_path: Path) -> None:
-    options = CompareOptions(downscale=8, device="cpu", report_views=0)
-    results = polarguide.compare([water], ["3dgs"], tmp_path, settings=TrainSettings(2), options=options)
-    assert index_of(tmp_path / results.runs["folder"][0]) == 1.33
-    assert results.record.settings.refractive_index is None
-    assert results.record.scenes[0].refractive_index == 1.33
+    options = CompareOptions(downscale=4, device="cpu")
+    comparison = Comparison((water,), (RECIPES["3dgs"],), TrainSettings(2), options, tmp_path)
+    scenes = scene_entries(comparison)
+    assert scenes[0].refractive_index == 1.33
+    (planned,) = plan_runs(comparison, scenes)
+    assert planned.settings.refractive_index == 1.33
 
 
 def test_one_that_is_asked_for_overrides_the_scene(water: Path, tmp_path: Path) -> None:
