@@ -57,11 +57,15 @@ def draw_scores(results: Results, metrics: list[Metric]) -> Figure:
     """Draw a panel for each metric, with the recipes at the x axis and a color for each scene."""
     rows = -(-len(metrics) // PANELS)
     names = 0.07 * max(map(len, results.recipes))  # inches of the longest name, which is written upwards
-    figure = Figure(figsize=(WIDTH_INCHES, rows * (HEIGHT_INCHES + names)), layout="constrained")
+    figure = Figure(figsize=(WIDTH_INCHES, rows * HEIGHT_INCHES + names), layout="constrained")
     grid = figure.subplots(rows, PANELS, squeeze=False).ravel()
-    for axes, metric in zip(grid, metrics, strict=False):
+    empty = grid.size - len(metrics)
+    used = [*grid[: PANELS - empty], *grid[PANELS:]]  # only the first row may be incomplete
+    for axes, metric in zip(used, metrics, strict=True):
         _draw_panel(axes, results, metric)
-    for axes in grid[len(metrics) :]:
+    for axes in used[:-PANELS]:
+        axes.set_xticklabels([])  # the last row has the names of the recipes
+    for axes in grid[PANELS - empty : PANELS]:
         axes.remove()
     if len(results.scenes) > 1:
         handles, labels = grid[0].get_legend_handles_labels()

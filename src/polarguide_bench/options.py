@@ -127,7 +127,7 @@ class BatchOptions(ClusterOptions):
     """Options for processing captures.
 
     Attributes:
-        formats: Export formats: ply, spz, sog, mesh, points, environment or cameras.
+        formats: Export formats: ply, spz, mesh, environment or cameras.
         device: Device of trainings and renderings.
     """
 

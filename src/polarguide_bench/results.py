@@ -26,8 +26,6 @@ from polarguide.core.records import read_record, shortened
 from polarguide.results.evaluation.table import COLUMNS, PART_METRICS, Metric
 
 FORMAT = "polarguide-results-2"
-FORMER = "polarguide-results-1"
-"""Name of the previous format, which has no objects, materials, black pixels, reference recipe and differences."""
 REMEDY = "Give the command again to write a new record."
 _Item = TypeVar("_Item")
 _Filled = Annotated[list[_Item], Meta(min_length=1)]
@@ -62,8 +60,7 @@ class Settings(msgspec.Struct):
         seeds: number of seeds.
         downscale: factor by which pictures are reduced.
         transfer: transfer function of the pictures.
-        refractive_index: refractive index of all scenes, or None if each scene has its own. Earlier records contain 0
-            instead.
+        refractive_index: refractive index of all scenes, or None if each scene has its own.
         threads: threads of each run.
         jobs: number of simultaneous runs. 0 means that it was chosen automatically.
         against: reference recipe of the differences.
@@ -81,10 +78,6 @@ class Settings(msgspec.Struct):
     against: str | None = None
     background: str = "scene"
     materials: str = "dielectric"
-
-    def __post_init__(self) -> None:
-        if self.refractive_index == 0:
-            self.refractive_index = None
 
 
 class SceneRecord(msgspec.Struct):
@@ -182,8 +175,7 @@ class Record(msgspec.Struct):
     runs: _Filled[RunRecord]
 
     def __post_init__(self) -> None:
-        _require_one_of("format", self.format, (FORMAT, FORMER))
-        self.format = FORMAT
+        _require_one_of("format", self.format, (FORMAT,))
         names = {"scene": [s.name for s in self.scenes], "recipe": [r.name for r in self.recipes]}
         for kind, names_of_kind in names.items():
             require(
@@ -207,7 +199,7 @@ class Record(msgspec.Struct):
 
 
 def read_results(path: Path) -> Record:
-    """Read a ``results.json`` in the current or the previous format.
+    """Read a ``results.json``.
 
     Raises:
         PolarguideError: the file is missing or invalid. The message names the key.

@@ -232,7 +232,7 @@ def _perform(task: Task) -> None:
         _wait_for_others(Path(task.folder))
         _train_run(task)
     else:
-        run = open_compared(task.folder, task.compute.device)
+        run: Any = open_compared(task.folder, task.compute.device)
         evaluate(run, speed=task.speed, surface=run.surface if isinstance(run, FieldRun) else None)
 
 

@@ -33,7 +33,7 @@ def test_what_is_written_passes(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("path", "value", "where", "expected"),
     [
-        (("format",), "other", "format", "one of polarguide-results-2, polarguide-results-1"),
+        (("format",), "other", "format", "one of polarguide-results-2"),
         (("provenance", "date"), None, "provenance.date", "text"),
         (("provenance", "commit"), 3, "provenance.commit", "text or null"),
         (("settings", "steps"), "10", "settings.steps", "a whole number"),
@@ -88,16 +88,14 @@ def test_stored_results_are_read_and_shown(path: Path) -> None:
     assert len(scores_section(stored).blocks) == len(stored.scenes) + (len(stored.scenes) > 1)
 
 
-def test_a_record_of_the_version_before_is_completed(tmp_path: Path) -> None:
-    former = two() | {"format": "polarguide-results-1"}
+def test_a_record_without_later_fields_is_completed(tmp_path: Path) -> None:
+    former = two()
     del former["settings"]["against"], former["scenes"][0]["black_share"]
     for item in former["runs"]:
         del item["objects"], item["materials"], item["metrics"]["ssim"]
-    former["settings"]["refractive_index"] = 0.0
     (tmp_path / "results.json").write_text(json.dumps(former))
     read = read_results(tmp_path / "results.json")
-    assert (read.format, read.settings.against, read.runs[0].objects) == ("polarguide-results-2", None, {})
-    assert read.settings.refractive_index is None
+    assert (read.settings.against, read.runs[0].objects) == (None, {})
     assert [scene.black_share for scene in read.scenes] == [None, 0.0]
     assert not any("SSIM" in heading for heading in scores_section(Results(read)).headings)
 

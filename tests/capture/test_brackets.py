@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 import tifffile
+import torch
 from bracketed import (
     SENSOR,
     SIZE,
@@ -27,7 +28,7 @@ from polarguide.capture.brackets import Bracket, Radiance, measure_exposures
 from polarguide.capture.brackets import merge as merge_measured
 from polarguide.capture.exposure_files import exposure_name, list_shot_files
 from polarguide.capture.layout import find_layout
-from polarguide.capture.view_reader import ViewData, read_view
+from polarguide.capture.view_reader import StoredViews, ViewData, read_view
 from polarguide.core.progress import Reporter
 from polarguide.geometry.polarizer import ANGLES, malus
 from polarguide.inspection.capture import read_capture
@@ -415,6 +416,8 @@ def test_inspect_shows_the_range(tmp_path: Path) -> None:
         write_bracket(tmp_path / "raw", view)
     prepared(tmp_path / "raw", MOSAIC)
     capture = read_capture(tmp_path / "scene")
+    assert {view.codes.dtype for view in capture.views} == {torch.float32}
+    assert not any(bool(view.saturated.any()) for view in capture.views)
     saturation, *_ = light_checks(capture, [measure_view(view, 1.5) for view in capture.views])
     largest = max(float(view.codes.max()) for view in capture.views) / 65535
     assert f"The largest value is {largest:.1f} times full scale" in saturation.finding
@@ -432,6 +435,7 @@ def test_radiance_of_a_scene(tmp_path: Path) -> None:
     full = read_view(find_layout(tmp_path / "scene"), "a", factor=1, transfer="linear")
     np.testing.assert_allclose(data.codes.mean(), full.codes.mean(), rtol=1e-5)
     assert not data.saturated(65535)[~data.black].any()
+    assert StoredViews.of([full], [None]).picture_warnings("linear") == []
     Fault("a_000.tif", "linear", "srgb").raised_by(
         read_view, find_layout(tmp_path / "scene"), "a", factor=1, transfer="srgb"
     )

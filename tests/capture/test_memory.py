@@ -32,7 +32,7 @@ from polarguide_shots.read import read_shot
 def capture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> TinyCapture:
     made = write_tiny_capture(tmp_path / "tiny")
 
-    def decode(*_: object) -> None:
+    def decode(*_: object, **__: object) -> None:
         raise AssertionError("a picture was decoded")
 
     monkeypatch.setattr("polarguide.capture.view_reader.decode_picture", decode)

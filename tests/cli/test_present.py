@@ -138,7 +138,6 @@ def test_exports_are_cropped_upright_in_meters_and_say_whose_they_are(copy: Path
     assert "# units meters" in (tmp_path / "sparse" / "0" / "cameras.txt").read_text()
     poses = json.loads((tmp_path / "transforms.json").read_text())
     assert (poses["author"], poses["units"]) == ("A", "meters")
-    trained.export("sog", tmp_path)
     trained.export("spz", tmp_path)
 
 

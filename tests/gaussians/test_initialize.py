@@ -16,6 +16,7 @@ from polarguide.gaussians.initialize import (
     initial_parameters,
     neighbor_distance,
     scene_extent,
+    stretch_steps,
 )
 from polarguide.geometry.camera import Camera
 
@@ -67,6 +68,16 @@ def test_added_ones_lie_in_the_shell() -> None:
     distance = (rows["means"][30:] - middle).norm(dim=1) / radius
     assert 2.99 < float(distance.min()) < float(distance.max()) < 12.01
     assert float(rows["log_scales"][30:].mean()) > float(rows["log_scales"][:30].mean())
+
+
+def test_steps_beyond_the_cameras_grow_with_distance() -> None:
+    middle = torch.tensor([1.0, 0.0, 0.0])
+    before = middle + torch.tensor([[0.5, 0.0, 0.0], [0.0, 2.0, 0.0], [0.0, 0.0, 80.0]])
+    step = torch.tensor([[0.1, 0.0, 0.0], [0.0, 0.1, 0.0], [0.1, 0.1, 0.0]])
+    means = before + step
+    stretch_steps(means, before, middle, 2.0)
+    torch.testing.assert_close(means[:2], (before + step)[:2])
+    torch.testing.assert_close(means[2] - before[2], 40 * step[2], rtol=1e-4, atol=1e-4)
 
 
 def test_none_are_added_if_none_are_asked_for() -> None:

@@ -77,7 +77,7 @@ WRITERS = (
     Writer("inspect --fix", _fix, (0.6,)),
     Writer("share", "share run --out new/page.html", (0.6,)),
     *(Writer(f"export {kind}", export(kind), (0.6,))
-      for kind in ("ply", "spz", "sog", "environment", "cameras", "normals")),
+      for kind in ("ply", "spz", "environment", "cameras", "normals")),
     Writer("compare", f"compare scene --recipes 3dgs polarguide {STEPS} --out new"),
     Writer("synth", "synth proof --out new --size 16x16 --samples 1"),
     Writer("bench", "bench --out new", once=True),

@@ -56,7 +56,7 @@ CASES += table(
     "run in a folder whose name is no UTF-8:", "",
     Case("eval", command=_named(EVAL, source=name), ci=True),
     *(Case(f"export {kind}", command=["export", name, "--format", kind, *ONE.split()], ci=kind == "environment")
-      for kind in ("ply", "sog", "environment", "cameras", "normals")),
+      for kind in ("ply", "environment", "cameras", "normals")),
     Case("share", command=["share", name, *ONE.split()]),
     Case("maps", command=_named(MAPS.replace("npy", "exr"), name), ci=True),
     Case("a film", command=[*_named(film, source=name), f"{name}/a.mp4"]),

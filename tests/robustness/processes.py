@@ -43,7 +43,7 @@ def _whole(most: int) -> Callable[[], None]:
 
 WRITERS = {
     "train": TRAIN, "resume": RESUME, "eval": EVAL, "share": SHARE, "render": RENDER, "prepare": MOSAICS,
-    **{f"export {kind}": export(kind) for kind in ("ply", "spz", "sog", "environment", "cameras", "normals")},
+    **{f"export {kind}": export(kind) for kind in ("ply", "spz", "environment", "cameras", "normals")},
 }  # fmt: skip
 CASES += [
     Case(f"files of at most {most} bytes, {name}", limit(resource.RLIMIT_FSIZE, most), command, check=_whole(most),

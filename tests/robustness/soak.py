@@ -55,7 +55,7 @@ COMMANDS: dict[str, Callable[[str], str]] = {
     **{f"train {recipe}": train(recipe) for recipe in RECIPES},
     "prepare": lambda out: into(out, MOSAICS),
     **{f"export {kind}": lambda out, kind=kind: into(out, export(kind))
-       for kind in ("ply", "sog", "spz", "cameras", "normals", "environment")},
+       for kind in ("ply", "spz", "cameras", "normals", "environment")},
     "share": lambda out: f"share run --out {out}/page.html {ONE}",
     "compare": lambda out: f"compare scene --recipes 3dgs polarguide {STEPS} --out {out} --report-views 0",
 }  # fmt: skip

@@ -220,7 +220,7 @@ def test_a_second_training_into_a_run_is_refused(demo_scene: Path, tmp_path: Pat
 def test_a_finished_run_keeps_no_state_of_the_optimizer(
     demo_scene: Path, tmp_path: Path, state: TrainingState
 ) -> None:
-    reading, settings = SceneOptions(downscale=8), TrainSettings(3)
+    given = {"recipe": "3dgs", "reading": SceneOptions(downscale=8), "settings": TrainSettings(3)}
 
     def names(run: Path) -> set[str]:
         with safe_open(run / CHECKPOINT, framework="pt") as file:
@@ -232,17 +232,15 @@ def test_a_finished_run_keeps_no_state_of_the_optimizer(
         session = SessionOptions(keep_optimizer=keep, checkpoint_every=2)
         stop = iter((False, False, True)).__next__
         with pytest.raises(TrainingStopped):
-            polarguide.train(
-                demo_scene, out, settings=settings, reading=reading, session=session, should_stop=stop
-            )
+            polarguide.train(demo_scene, out, **given, session=session, should_stop=stop)
         assert "adam" in names(out)
-        polarguide.train(demo_scene, out, settings=settings, reading=reading, session=session, resume=True)
+        polarguide.train(demo_scene, out, **given, session=session, resume=True)
         assert ("adam" in names(out)) == keep
     # It is as good as before for all that is done with it, and a further resume of what is finished does nothing.
     pictures = [polarguide.open_run(tmp_path / str(keep)).render("v000")["final"] for keep in (False, True)]
     assert bool((pictures[0] == pictures[1]).all())
     before = (tmp_path / "False" / CHECKPOINT).read_bytes()
-    polarguide.train(demo_scene, tmp_path / "False", settings=settings, reading=reading, resume=True)
+    polarguide.train(demo_scene, tmp_path / "False", **given, resume=True)
     assert (tmp_path / "False" / CHECKPOINT).read_bytes() == before
     frozen = {f"frozen.{name}": values for name, values in state.gaussians.snapshot().items()}
     save_checkpoint(tmp_path, replace(state, extra=frozen), optimizer=False)

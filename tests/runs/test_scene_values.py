@@ -76,7 +76,7 @@ def test_without_settings_it_is_that_of_the_scene(water: Path, tmp_path: Path) -
 
 
 def test_a_comparison_takes_it_too(water: Path, tmp_path: Path) -> None:
-    options = CompareOptions(downscale=4, device="cpu", report_views=0)
+    options = CompareOptions(downscale=8, device="cpu", report_views=0)
     results = polarguide.compare([water], ["3dgs"], tmp_path, settings=TrainSettings(2), options=options)
     assert index_of(tmp_path / results.runs["folder"][0]) == 1.33
     assert results.record.settings.refractive_index is None

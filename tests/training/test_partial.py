@@ -243,6 +243,17 @@ def _view(number: int) -> View:
     )
 
 
+def test_the_shell_is_near_without_measured_stokes_vectors(tiny_scene: Scene) -> None:
+    """Distant Gaussians behind a surface could explain its reflections where one picture is all that a view has."""
+    distances = []
+    for scene in (tiny_scene, glossy_table()):
+        trainer = make_trainer(scene, RECIPES["polarguide-stokes"], 10, seed=0)
+        means = trainer.state.gaussians["means"].detach()[-100:]
+        distances.append(float((means - trainer.context.middle).norm(dim=1).median()) / trainer.context.reach)
+    assert distances[0] > 50
+    assert 3 < distances[1] < 12
+
+
 @pytest.mark.slow
 def test_blocked_light_does_not_run_away() -> None:
     """With S0 as rendered in the term of S1 and S2, one view was 75 % off; without, it is 22 %."""

@@ -229,7 +229,8 @@ class ViewData:
         material_numbers: labels that occur in the file of materials.
         ground_truth: ground truth, see ``View.ground_truth``.
         size: width and height of the stored pictures.
-        peak: largest stored value in each averaged box, over all angles and channels, [H, W].
+        peak: largest stored value in each averaged box, over all angles and channels, [H, W]. Radiance is in units of
+            16-bit codes.
         black: mask of the averaged boxes with a pixel that is 0 at all angles and in all channels, [H, W].
         histogram: result of ``checks.top_histogram`` for the stored values.
         digests: SHA-256 of each file.
@@ -461,6 +462,8 @@ def view_data(
     """
     height, width = raw[0].shape[:2]
     peak = functools.reduce(np.maximum, [pixels[..., channel] for pixels in raw for channel in range(3)])
+    if peak.dtype == np.float32:
+        peak = linear_codes(peak, transfer)
     return ViewData(
         name=name,
         size=(width, height),

@@ -387,7 +387,7 @@ def export_run(
 ) -> None:
     """Export a run to the file formats of other programs.
 
-    Splats (ply, spz, sog, splat-glb, splat-usdz) have reflections baked into harmonics. The mesh (GLB and PLY) is fused
+    Splats (ply, spz, splat-glb, splat-usdz) have reflections baked into harmonics. The mesh (GLB and PLY) is fused
     from rendered depth and has diffuse colors and learned normals. The textured model (glb, usdz) is for Blender, game
     engines and viewers. Its base color has no highlights and no shading. Its closed surface (stl) is for 3D printing.
     The environment is the learned light as a panorama (EXR, HDR and PNG). The cameras are a COLMAP model and
@@ -396,7 +396,7 @@ def export_run(
 
     Args:
         run: Run folder.
-        format: ply, spz, sog, splat-glb, splat-usdz, mesh, glb, usdz, stl, environment, cameras, normals or all.
+        format: ply, spz, splat-glb, splat-usdz, mesh, glb, usdz, stl, environment, cameras, normals or all.
         out: Folder to write; default: RUN/export.
         resolution: Voxels of the mesh along its longest side.
         spz_version: Version of the SPZ file; programs support only one of the two.

@@ -26,7 +26,6 @@ EXPOSURES: tuple[Exposures, ...] = get_args(Exposures)
 ExportFormat = Literal[
     "ply",
     "spz",
-    "sog",
     "splat-glb",
     "splat-usdz",
     "mesh",

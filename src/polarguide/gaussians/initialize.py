@@ -20,12 +20,15 @@ class Initialization:
         shell: number of Gaussians in a shell far around the capture, for surroundings that SfM does not triangulate. No
             random Gaussians are added inside the shell, because they become haze in front of the cameras.
         shell_radii: inner and outer radius of the shell around the median of the points, in units of the cameras'
-            distance.
+            distance. At these distances Gaussians have almost no parallax, like the sky and the horizon.
+        near_radii: the same for captures with too few polarizer angles per view to measure the Stokes vectors. There,
+            distant Gaussians behind a transparent surface could explain the reflection of a distant light.
         opacity: initial opacity of all Gaussians.
     """
 
     shell: int = 4000
-    shell_radii: tuple[float, float] = (3.0, 12.0)
+    shell_radii: tuple[float, float] = (50.0, 200.0)
+    near_radii: tuple[float, float] = (3.0, 12.0)
     opacity: float = 0.1
 
 
@@ -54,6 +57,21 @@ def camera_reach(points: np.ndarray, cameras: np.ndarray) -> tuple[np.ndarray, f
     """Return the median of the points [M, 3], and a distance from it that 90 % of the cameras [V, 3] do not exceed."""
     middle = np.median(points, axis=0)
     return middle, float(np.quantile(np.linalg.norm(cameras - middle, axis=1), 0.9))
+
+
+def stretch_steps(means: Tensor, before: Tensor, middle: Tensor, reach: float) -> None:
+    """Lengthen, in place, the steps of Gaussians beyond the cameras in proportion to their distance.
+
+    The step of a Gaussian then has the same size in a picture at every distance.
+
+    Args:
+        means: [N, 3] positions after the step.
+        before: [N, 3] positions before the step.
+        middle: [3] median of the points.
+        reach: distance of the cameras from the median.
+    """
+    factor = ((before - middle).norm(dim=1, keepdim=True) / reach).clamp(min=1)
+    means.copy_(torch.where(factor > 1, torch.lerp(before, means, factor), means))
 
 
 def far_away(means: Tensor, points: Tensor, centers: Tensor, share: float = 1.0) -> Tensor:

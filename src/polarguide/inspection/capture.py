@@ -208,7 +208,7 @@ def _inspected_view(item: ViewData, camera: Camera | None, full_scale: int | Non
         saturated=torch.from_numpy(item.saturated(full_scale)),
         black=torch.from_numpy(item.black),
         camera=camera,
-        peak=int(item.codes.max()) if item.is_radiance else int(item.peak.max()),
+        peak=int(item.peak.max()),
         exposures=item.exposures,
     )
 

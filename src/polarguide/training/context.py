@@ -6,7 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from polarguide.capture import Scene, View
@@ -60,7 +62,16 @@ class TrainingContext:
     @cached_property
     def reach(self) -> float:
         """Distance from the middle of the points that nine tenths of the cameras do not exceed."""
-        return camera_reach(self.scene.points.double().numpy(), self.centers.double().numpy())[1]
+        return self._region[1]
+
+    @cached_property
+    def middle(self) -> Tensor:
+        """Median of the points on the device of the backend, [3] float32."""
+        return torch.from_numpy(self._region[0]).float().to(self.backend.device)
+
+    @cached_property
+    def _region(self) -> tuple[NDArray[np.float64], float]:
+        return camera_reach(self.scene.points.double().numpy(), self.centers.double().numpy())
 
     @cached_property
     def shading(self) -> ShadingModel:

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from polarguide.gaussians.initialize import stretch_steps
 from polarguide.raster import ScreenStatistic
 from polarguide.shading.gbuffer import RenderRequest, render
 from polarguide.shading.model import PLAIN
@@ -137,8 +138,11 @@ class TrainingLoop(Loop):
         factor = math.sqrt(self.settings.views_per_step)
         for name, rate in self.rates.items():
             self.state.gaussians.set_rate(name, rate * factor)
+        means = self.state.gaussians["means"].detach()
+        before = means.clone()
         for optimized in self.state.optimized:
             optimized.step()
+        stretch_steps(means, before, self.current.middle, self.current.reach)
 
     def _enter_step(self) -> None:
         """Look up the position and the learning rates of the next step."""

@@ -209,7 +209,11 @@ def first_state(context: TrainingContext) -> TrainingState:
     recipe = context.recipe
     seed = context.settings.seed
     device = context.backend.device
-    initialization = replace(recipe.initialization, shell=0) if context.black else recipe.initialization
+    initialization = recipe.initialization
+    if context.black:
+        initialization = replace(initialization, shell=0)
+    if not all(view.is_determined for view in context.views):
+        initialization = replace(initialization, shell_radii=initialization.near_radii)
     colors = srgb_decode(scene.point_colors.float() / 255)
     centers = context.centers
     tensors = initial_parameters(scene.points, colors, centers, initialization, seed=seed)

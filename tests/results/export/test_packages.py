@@ -167,7 +167,7 @@ def test_a_package_tells_of_itself(credited: Path, tmp_path: Path, monkeypatch: 
     record = json.loads((out / "model.json").read_text())
     assert {*record["files"], "model.json"} == {path.name for path in out.iterdir()}
     assert {"model.glb", "model-unlit.glb", "splats-srgb.glb", "environment.hdr", "preview.png"} | {
-        f"splats.{kind}" for kind in ("ply", "spz", "sog")
+        f"splats.{kind}" for kind in ("ply", "spz")
     } <= {*record["files"]}
     about = (record["title"], record["author"], record["license"], record["units"], record["scale_of_scene"])
     assert about == ("A thing", "Somebody", "CC0", "meters", 0.5)

@@ -116,7 +116,6 @@ def test_a_chart_of_a_scene_reaches_pictures_splats_mesh_points_and_light_of_its
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("polarguide.results.rendering.mesh.OPAQUE", 0.05)  # nothing is opaque yet
-    monkeypatch.setattr("polarguide.results.export.mesh.OPAQUE", 0.05)
     charted, run_folder = (
         Path(shutil.copytree(folder, tmp_path / folder.name)) for folder in (demo_scene, trained)
     )

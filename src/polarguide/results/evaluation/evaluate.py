@@ -8,20 +8,19 @@ import statistics
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 import polarguide
 from polarguide import _native, optics
-from polarguide.capture import Scene, View
+from polarguide.capture import View
 from polarguide.capture.view import listed
 from polarguide.core.errors import PolarguideError
 from polarguide.core.progress import SILENT, Reporter
 from polarguide.core.system import peak_memory_mib
 from polarguide.gaussians.initialize import camera_reach
-from polarguide.geometry.camera import Camera
 from polarguide.optics import Mount
 from polarguide.optics.color import shown
 from polarguide.results.evaluation.coverage import (
@@ -38,7 +37,8 @@ from polarguide.results.evaluation.table import registered_digests
 from polarguide.results.evaluation.target import SceneFacts, ViewTarget
 from polarguide.results.rendering.mesh import RESOLUTION, Surface, fused_surface
 from polarguide.runs.callbacks import Stopwatch
-from polarguide.runs.folder import RunConfiguration, RunLog
+from polarguide.runs.folder import RunLog
+from polarguide.runs.opened import OpenedRun
 from polarguide.shading.result import RenderResult
 from polarguide.training.angles.polarizers import fit_angle
 from polarguide.visualization import figures
@@ -274,62 +274,8 @@ NO_PEAK = "the process used more memory before scoring"
 OTHER_WORK = "other work ran on the machine at the same time"
 
 
-class ScoredModel(Protocol):
-    """Interface of a trained model for scoring; ``runs.model.GaussianModel`` implements it."""
-
-    @property
-    def device(self) -> torch.device:
-        """Device of the rendering."""
-
-    @property
-    def gaussians(self) -> int | None:
-        """Number of Gaussians, or None if the model does not consist of Gaussians."""
-
-    def render(
-        self, camera: Camera, *, normals: bool = True, depth: bool = False, surface: bool = False
-    ) -> RenderResult:
-        """Render the layers of a view."""
-
-    def stokes(self, result: RenderResult, camera: Camera) -> Tensor | None:
-        """Predict Stokes vectors [3, H, W, 3]; return None if the model predicts no polarization."""
-
-    def alpha_in_front(self, camera: Camera, depth: Tensor) -> Tensor:
-        """Return the share [H, W] of each pixel's alpha that lies in front of a depth [H, W]."""
-
-
-class ScoredRun(Protocol):
-    """Interface of a run for scoring; ``runs.opened.OpenedRun`` implements it."""
-
-    @property
-    def folder(self) -> Path:
-        """Run folder."""
-
-    @property
-    def configuration(self) -> RunConfiguration:
-        """Configuration of the run."""
-
-    @property
-    def model(self) -> ScoredModel:
-        """Trained model."""
-
-    @property
-    def scene(self) -> Scene:
-        """Scene of the run."""
-
-    @property
-    def steps(self) -> int:
-        """Number of training steps."""
-
-    @property
-    def cameras(self) -> dict[str, Camera]:
-        """Cameras of the scene's views by name."""
-
-    def undecided(self, camera: Camera) -> Tensor | None:
-        """Render the share [H, W] of possible metals; return None if the training did not search for metals."""
-
-
 def evaluate(
-    run: ScoredRun,
+    run: OpenedRun,
     *,
     speed: bool = False,
     surface: Callable[[], Surface] | None = None,
@@ -338,7 +284,7 @@ def evaluate(
     """Score the test views of a run and write ``metrics.json`` and ``errors.png`` into its folder.
 
     Args:
-        run: the run to score.
+        run: the run to score, or an object with the attributes of a run that this module reads.
         speed: measure frames per second. Other work on the machine makes this measurement invalid.
         surface: computes the surface for the mesh scores. None fuses rendered depth maps to a surface.
         reporter: receives progress and warnings.
@@ -403,7 +349,7 @@ def evaluate(
     )
 
 
-def _coverage(run: ScoredRun, reporter: Reporter) -> Coverage:
+def _coverage(run: OpenedRun, reporter: Reporter) -> Coverage:
     """Find the pixels of the test views whose content is visible in a training view.
 
     The depth of a test view comes from the ground truth if it has one. All other depths are rendered.
@@ -435,7 +381,7 @@ def _coverage(run: ScoredRun, reporter: Reporter) -> Coverage:
 
 
 def _score(
-    run: ScoredRun,
+    run: OpenedRun,
     view: View,
     facts: SceneFacts,
     seen: Tensor,
@@ -471,14 +417,14 @@ def _peak_memory(before: float | None) -> dict[str, Any]:
     return {"peak_memory_mib": peak, "peak_memory_mib_reason": None}
 
 
-def _fuse_depths(run: ScoredRun) -> Surface:
+def _fuse_depths(run: OpenedRun) -> Surface:
     surface, _, _ = fused_surface(
         run.cameras, lambda camera: run.model.render(camera, depth=True, surface=True), resolution=RESOLUTION
     )
     return surface
 
 
-def _speed(run: ScoredRun, *, normals: bool = True, depth: bool = False) -> float | None:
+def _speed(run: OpenedRun, *, normals: bool = True, depth: bool = False) -> float | None:
     def draw(view: View) -> None:
         run.model.render(view.camera, normals=normals, depth=depth)
         if run.model.device.type == "cuda":
@@ -487,7 +433,7 @@ def _speed(run: ScoredRun, *, normals: bool = True, depth: bool = False) -> floa
     return frames_per_second(draw, run.scene.test_views)
 
 
-def _provenance(run: ScoredRun) -> dict[str, Any]:
+def _provenance(run: OpenedRun) -> dict[str, Any]:
     configuration = run.configuration
     device = run.model.device
     processor = torch.cuda.get_device_name(device) if device.type == "cuda" else _native.simd()

@@ -51,7 +51,7 @@ from polarguide.results.export.placement import (
     rewrite_splats,
     transforms,
 )
-from polarguide.results.export.splats import COLOR_SPACES, Encoding, write_sog, write_splat_glb, write_spz
+from polarguide.results.export.splats import COLOR_SPACES, Encoding, write_splat_glb, write_spz
 from polarguide.results.export.usd import write_splat_usdz, write_usdz
 from polarguide.results.export.views import export_cameras, export_normals
 from polarguide.results.rendering.mesh import RESOLUTION, scene_mesh
@@ -72,7 +72,6 @@ FILES = {
     "model-unlit.glb": "textured mesh with the picture's colors, for viewers without light",
     "splats.ply": "splats, -y up (SuperSplat, Spark, Unity, Unreal)",
     "splats.spz": "the same, compressed, +y up",
-    "splats.sog": "the same, compressed, -y up",
     "splats-srgb.glb": "splats for readers that blend encoded colors (Babylon, PlayCanvas)",
     "splats-linear.glb": "splats for readers that blend linear colors (three.js)",
     "environment.exr": "the learned light as a panorama of linear radiance",
@@ -144,8 +143,8 @@ def export(
     """Export a run: its subject upright, in meters, and in the color of its presentation.
 
     Args:
-        run: the run. The formats ply, spz and sog read only poses and masks of its scene.
-        format: format of the file. Splats (ply, spz, sog, splat-glb, splat-usdz) have reflections baked into harmonics.
+        run: the run. The formats ply and spz read only poses and masks of its scene.
+        format: format of the file. Splats (ply, spz, splat-glb, splat-usdz) have reflections baked into harmonics.
             The mesh (GLB and PLY) is fused from rendered depth and has diffuse colors and learned normals. The textured
             model is glb or usdz, and its closed surface stl. The environment is the learned light as a panorama (EXR,
             HDR and PNG). The cameras are a COLMAP model and transforms.json. The normals are poses, pictures and normal
@@ -259,14 +258,6 @@ class _Exporter:
         placement = replace(self.presented.placement, rotation=rotation, scale=1.0, metric=False)
         return self._from_ply("splats.spz", partial(write_spz, version=self.spz_version), placement)
 
-    def sog(self) -> list[Path]:
-        credit = self.presented.presentation.credit
-        asset = {
-            **({"copyright": credit} if credit else {}),
-            "extras": {**self.presented.origin.record(), **self.presented.placement.record()},
-        }
-        return self._from_ply("splats.sog", partial(write_sog, asset=asset))
-
     def splat_glbs(self) -> list[Path]:
         """Write splats as GLB files, one for each encoding of colors."""
         placement = self.presented.upright(self.run)
@@ -361,7 +352,6 @@ class _Exporter:
                 package._textured(subject, options, "glb")
             package._ply(parts / "splats.ply")
             package.spz()
-            package.sog()
             package.splat_glbs()
             if radiant:
                 package.environment()
@@ -401,7 +391,6 @@ class _Exporter:
 _WRITERS: dict[str, Callable[[_Exporter], list[Path]]] = {
     "ply": _Exporter.plys,
     "spz": _Exporter.spz,
-    "sog": _Exporter.sog,
     "splat-glb": _Exporter.splat_glbs,
     "splat-usdz": _Exporter.splat_usdz,
     "mesh": _Exporter.mesh,
