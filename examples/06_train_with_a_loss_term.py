@@ -7,7 +7,7 @@ import sys
 from dataclasses import dataclass, replace
 
 import polarguide
-from polarguide.recipes import recipe_named
+from polarguide.methods import recipe_named
 from polarguide.training.losses import Weights, term
 
 

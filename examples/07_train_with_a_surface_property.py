@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import torch
 
 import polarguide
-from polarguide.recipes import recipe_named
+from polarguide.methods import recipe_named
 from polarguide.shading.deferred import DeferredShading
 from polarguide.shading.surface import SurfaceProperty
 

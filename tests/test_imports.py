@@ -34,7 +34,7 @@ ROOMS = (
     "polarguide.visualization",
     "polarguide.training",
     "polarguide.training.angles",
-    "polarguide.recipes",
+    "polarguide.methods",
     "polarguide.runs",
     "polarguide.results.rendering",
     "polarguide.results.evaluation",

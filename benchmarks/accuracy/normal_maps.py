@@ -33,7 +33,7 @@ import polarguide
 from polarguide.capture import Scene
 from polarguide.geometry.camera import Camera
 from polarguide.geometry.vectors import dot, unit
-from polarguide.recipes import recipe_named
+from polarguide.methods import recipe_named
 from polarguide.training.losses import Weights, term
 from polarguide.training.recipe import Recipe
 from polarguide.training.targets import Step

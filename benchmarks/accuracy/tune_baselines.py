@@ -22,8 +22,8 @@ from typing import Any
 import torch
 
 import polarguide as pg
-from polarguide.recipes import recipe_named
-from polarguide.recipes.baselines import RESET
+from polarguide.methods import recipe_named
+from polarguide.methods.baselines import RESET
 from polarguide.results.evaluation.record import read_metrics
 from polarguide.shading.deferred import DeferredShading
 from polarguide.shading.directional import DirectionalShading

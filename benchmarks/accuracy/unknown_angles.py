@@ -28,8 +28,8 @@ import polarguide
 from polarguide.capture import Scene
 from polarguide.capture.exposures import FOUR, Exposure
 from polarguide.capture.view import View
+from polarguide.methods import recipe_named
 from polarguide.raster import choose_backend
-from polarguide.recipes import recipe_named
 from polarguide.runs.folder import resolve
 from polarguide.training.angles.fits import gaussian_training
 from polarguide.training.angles.polarizers import Judgment

@@ -11,9 +11,9 @@ from torch import Tensor
 
 from polarguide.capture import Scene
 from polarguide.gaussians.gaussians import CORE_SHAPES, Gaussians
+from polarguide.methods import RECIPES
 from polarguide.optics.color import srgb_encode
 from polarguide.raster import Backend, ScreenStatistic, Splats
-from polarguide.recipes import RECIPES
 from polarguide.runs.folder import resolve
 from polarguide.shading.gbuffer import RenderRequest, render
 from polarguide.training.angles.fits import gaussian_training

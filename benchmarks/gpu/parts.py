@@ -22,9 +22,9 @@ from packed import SUFFIX, enlarged, read_scene
 import polarguide
 from polarguide.capture import Scene
 from polarguide.gaussians.gaussians import Gaussians
+from polarguide.methods import RECIPES
 from polarguide.raster import Backend, choose_backend
 from polarguide.raster.cuda import has_gsplat
-from polarguide.recipes import RECIPES
 from polarguide.results.evaluation.metrics import psnr
 from polarguide.runs.folder import CHECKPOINT, load_checkpoint, resolve, save_checkpoint
 from polarguide.shading.gbuffer import render

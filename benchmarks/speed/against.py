@@ -37,7 +37,7 @@ try:
     from polarguide.raster import use_threads
 except ImportError:
     use_threads = torch.set_num_threads
-from polarguide.recipes import RECIPES
+from polarguide.methods import RECIPES
 
 try:
     from polarguide.runs.folder import resolve

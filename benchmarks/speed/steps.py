@@ -25,8 +25,8 @@ from polarguide.capture import load_scene
 from polarguide.core.errors import PolarguideError
 from polarguide.core.system import keep_freed_memory
 from polarguide.gaussians.gaussians import Trained
+from polarguide.methods import recipe_named
 from polarguide.raster import choose_backend, use_threads
-from polarguide.recipes import recipe_named
 from polarguide.runs.folder import CONFIGURATION, load_checkpoint, resolve
 from polarguide.training.angles.fits import gaussian_training
 from polarguide.training.context import TrainingContext

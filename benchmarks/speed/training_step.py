@@ -22,8 +22,8 @@ import torch
 
 from polarguide import _native
 from polarguide.capture import Scene, load_scene
+from polarguide.methods import RECIPES
 from polarguide.raster import choose_backend
-from polarguide.recipes import RECIPES
 from polarguide.runs.folder import resolve
 from polarguide.training.angles.fits import gaussian_training
 from polarguide.training.context import TrainingContext

@@ -127,12 +127,9 @@ def public_names() -> str:
             inherits = any(base.__module__.startswith(PACKAGE) for base in value.__mro__[1:])
             more = "   :inherited-members:\n" if inherits else ""
             directives.append(f".. autoclass:: {place}\n   :members:\n{more}")
-        elif inspect.ismodule(value):
-            if callable(value):  # recipes, a module and a function of the same name
-                directives.append(f".. autofunction:: {value.__name__}.registry.{name}\n   :no-index:\n")
         elif callable(value):
             directives.append(f".. autofunction:: {place}\n")
-        else:
+        elif not inspect.ismodule(value):
             directives.append(f".. autodata:: {place}\n")
     return "```{eval-rst}\n" + "\n".join(directives) + "```\n"
 

@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from polarguide.core.progress import Reporter
     from polarguide.geometry.camera import Camera
     from polarguide.inspection.settings import InspectSettings
+    from polarguide.methods.registry import recipes
     from polarguide.preparation.settings import PrepareSettings
-    from polarguide.recipes.registry import recipes
     from polarguide.results.evaluation.metric import Metric
     from polarguide.training.recipe import Recipe
     from polarguide.training.settings import TrainSettings
@@ -48,6 +48,7 @@ _NAMES = {
     "polarguide.core.progress": ("Reporter",),
     "polarguide.geometry.camera": ("Camera",),
     "polarguide.inspection.settings": ("InspectSettings",),
+    "polarguide.methods.registry": ("recipes",),
     "polarguide.preparation.settings": ("PrepareSettings",),
     "polarguide.results.evaluation.metric": ("Metric",),
     "polarguide.training.recipe": ("Recipe",),
@@ -114,8 +115,8 @@ __all__ = [
 def __getattr__(name: str) -> Any:
     if name == "__version__":
         value: Any = _version()
-    elif name in ("optics", "recipes"):
-        return importlib.import_module(f"polarguide.{name}")
+    elif name == "optics":
+        return importlib.import_module("polarguide.optics")
     elif name in _MODULES:
         value = getattr(_imported(_MODULES[name], name), name)
     else:

@@ -18,8 +18,8 @@ from polarguide.core.files import check_out, make_folder, require_inside, write_
 from polarguide.core.options import ComputeOptions, PathLike
 from polarguide.core.progress import SILENT, Reporter
 from polarguide.inspection.report import FILE as INSPECTION_PAGE
+from polarguide.methods import recipe_named
 from polarguide.raster import choose_backend
-from polarguide.recipes import recipe_named
 from polarguide.results.evaluation.record import read_metrics
 from polarguide.results.evaluation.table import COLUMNS
 from polarguide.runs.folder import CHECKPOINT, RunConfiguration

@@ -10,7 +10,7 @@ import cloudpickle
 
 from polarguide.core.definitions import definition_digest
 from polarguide.core.errors import PolarguideError, require
-from polarguide.recipes import registry
+from polarguide.methods import registry
 from polarguide.results.evaluation import table
 from polarguide.training.recipe import Recipe
 from polarguide_bench.children import Definitions

@@ -29,8 +29,8 @@ from polarguide.gaussians.gaussians import Parameters
 from polarguide.gaussians.harmonics import evaluate_sh
 from polarguide.geometry.camera import Camera
 from polarguide.geometry.vectors import dot, unit
-from polarguide.recipes.baselines import RATES
-from polarguide.recipes.polarguide import BEHIND
+from polarguide.methods.baselines import RATES
+from polarguide.methods.polarguide import BEHIND
 from polarguide.shading.cubemap import cubemap_lookup
 from polarguide.shading.model import (
     Channels,

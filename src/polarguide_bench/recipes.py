@@ -8,16 +8,16 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-from polarguide.recipes import registry
-from polarguide.recipes.baselines import RECIPE_3DGS, RECIPE_3DGS_DR
-from polarguide.recipes.polarguide import (
+from polarguide.methods import registry
+from polarguide.methods.baselines import RECIPE_3DGS, RECIPE_3DGS_DR
+from polarguide.methods.polarguide import (
     BEHIND,
     RECIPE_POLARGUIDE,
     RECIPE_POLARGUIDE_PAPER,
     RECIPE_POLARGUIDE_PAPER_KIND,
     RECIPE_POLARGUIDE_STOKES,
 )
-from polarguide.recipes.registry import (
+from polarguide.methods.registry import (
     LAYER_TERMS,
     POLARIZED_TERMS,
     UNPOLARIZED,
@@ -321,7 +321,7 @@ def recipe_named(name: str) -> AnyRecipe:
     """Return a recipe or an ablation by name.
 
     Raises:
-        PolarguideError: see ``polarguide.recipes.recipe_named``.
+        PolarguideError: see ``polarguide.methods.recipe_named``.
     """
     return FIELDS[name] if name in FIELDS else registry.recipe_named(name)
 

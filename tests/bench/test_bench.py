@@ -12,7 +12,7 @@ from faults import Fault
 from heard import Heard
 
 import polarguide
-from polarguide.recipes import recipe_named
+from polarguide.methods import recipe_named
 from polarguide.training.settings import TrainSettings
 from polarguide_bench import bench as benches
 from polarguide_bench.bench import run_bench

@@ -16,7 +16,7 @@ from tiny import make_scene
 import polarguide
 from polarguide.core import progress
 from polarguide.core.progress import NotebookReporter, notebook_reporter
-from polarguide.recipes import registry
+from polarguide.methods import registry
 from polarguide.results.evaluation import table
 from polarguide.results.evaluation.record import read_metrics
 from polarguide.training.losses import Weights, term

@@ -13,7 +13,7 @@ from heard import Heard
 
 import polarguide
 from polarguide.core.options import SceneOptions
-from polarguide.recipes import RECIPES, recipe_named
+from polarguide.methods import RECIPES, recipe_named
 from polarguide.results.evaluation.evaluate import evaluate
 from polarguide.results.evaluation.record import code_digest
 from polarguide.runs.opened import OpenedRun

@@ -15,9 +15,9 @@ from polarguide.capture import Scene
 from polarguide.gaussians.harmonics import SH_C0
 from polarguide.gaussians.ply import read_ply
 from polarguide.geometry.camera import Camera
+from polarguide.methods import recipe_named
+from polarguide.methods.registry import recipes
 from polarguide.raster import choose_backend
-from polarguide.recipes import recipe_named
-from polarguide.recipes.registry import recipes
 from polarguide.results.evaluation.scores import score_view
 from polarguide.results.evaluation.target import ViewTarget
 from polarguide.results.export.adapters import ply_fields

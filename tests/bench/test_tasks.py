@@ -13,7 +13,7 @@ from heard import Heard
 
 from polarguide.capture import Scene
 from polarguide.core.options import ComputeOptions, SceneOptions
-from polarguide.recipes import recipe_named
+from polarguide.methods import recipe_named
 from polarguide.results.evaluation.evaluate import evaluate
 from polarguide.runs.opened import OpenedRun
 from polarguide.training.settings import TrainSettings

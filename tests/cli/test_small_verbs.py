@@ -17,7 +17,7 @@ from made_sensor import made_sensor, write_codes, write_polarizer_shots
 
 from polarguide.cli.app import run
 from polarguide.core.errors import install_extra
-from polarguide.recipes import recipe_named
+from polarguide.methods import recipe_named
 from polarguide.runs.folder import CHECKPOINT, LOG
 from polarguide.training.settings import TrainSettings
 from polarguide_bench.options import CompareOptions

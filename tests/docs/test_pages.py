@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 import polarguide
-from polarguide.recipes import RECIPES
+from polarguide.methods import RECIPES
 from polarguide.results.evaluation.table import METRICS
 from polarguide_bench.recipes import ABLATIONS
 from polarguide_shots.measurement.table import FORMAT, KEYS

@@ -6,7 +6,7 @@ from typing import Any
 import torch
 
 from polarguide.geometry.camera import Camera
-from polarguide.recipes import RECIPES
+from polarguide.methods import RECIPES
 from polarguide.shading.deferred import DeferredShading
 from polarguide.shading.model import GBuffer, Light
 from polarguide.shading.surface import GltfTexture, SurfaceProperty

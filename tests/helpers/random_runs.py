@@ -8,7 +8,7 @@ from torch import Tensor
 
 from polarguide.gaussians.gaussians import Gaussians
 from polarguide.geometry.camera import Camera, look_at
-from polarguide.recipes import RECIPES
+from polarguide.methods import RECIPES
 from polarguide.shading.model import ShadingModel
 from polarguide.training.state import Environment, TrainingState
 

@@ -9,9 +9,9 @@ from torch import Tensor
 
 from polarguide.capture import Scene, View
 from polarguide.geometry.camera import Camera, look_at
+from polarguide.methods.baselines import SHADING_3DGS_DR
+from polarguide.methods.polarguide import RECIPE_POLARGUIDE
 from polarguide.raster import Splats, rasterize_reference
-from polarguide.recipes.baselines import SHADING_3DGS_DR
-from polarguide.recipes.polarguide import RECIPE_POLARGUIDE
 from polarguide.training.recipe import Recipe, Repeat, Stage, Weights
 from polarguide_bench.recipes import release_rates
 

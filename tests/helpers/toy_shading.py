@@ -8,7 +8,7 @@ from torch import Tensor
 
 from polarguide.geometry.camera import Camera
 from polarguide.geometry.vectors import unit
-from polarguide.recipes import RECIPES
+from polarguide.methods import RECIPES
 from polarguide.shading.model import (
     Channels,
     GBuffer,

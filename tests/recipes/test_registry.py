@@ -8,13 +8,13 @@ import pytest
 from faults import Fault
 from plugins import install
 
-from polarguide.recipes import RECIPES, recipe_named
+from polarguide.methods import RECIPES, recipe_named
 from polarguide.training.recipe import Stage
 from polarguide_bench.recipes import ABLATIONS, ablations_of
 
 MODULE = """
 from dataclasses import replace
-from polarguide.recipes import RECIPES
+from polarguide.methods import RECIPES
 ONE = replace(RECIPES["3dgs"], name="{name}", means_decay=0.5)
 SEVERAL = [ONE, replace(ONE, name="{name}:slow", means_decay=0.1)]
 NUMBER = 3

@@ -33,7 +33,7 @@ IMPORTED = (
 def warm_up() -> None:
     """Import all, and let recipes begin with fewer Gaussians."""
     import_all()
-    _shrink(importlib.import_module("polarguide.recipes.registry"))
+    _shrink(importlib.import_module("polarguide.methods.registry"))
 
 
 def import_all() -> None:

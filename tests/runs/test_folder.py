@@ -20,7 +20,7 @@ import polarguide
 from polarguide.capture import Scene
 from polarguide.core.errors import PolarguideError
 from polarguide.core.options import SceneOptions, SessionOptions
-from polarguide.recipes import RECIPES
+from polarguide.methods import RECIPES
 from polarguide.runs.callbacks import TrainingStopped
 from polarguide.runs.folder import (
     CHECKPOINT,

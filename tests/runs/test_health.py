@@ -21,8 +21,8 @@ from polarguide.capture.variants import select_exposures
 from polarguide.core.options import SceneOptions, SessionOptions
 from polarguide.core.progress import SILENT
 from polarguide.geometry.camera import Camera
+from polarguide.methods import RECIPES
 from polarguide.raster import choose_backend
-from polarguide.recipes import RECIPES
 from polarguide.runs.folder import RunLog
 from polarguide.runs.health import (
     HEALTH,

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from polarguide.capture import Scene
 from polarguide.core.options import Exposures, SceneOptions, gibibytes
-from polarguide.recipes import RECIPES
+from polarguide.methods import RECIPES
 from polarguide.runs import memory_plan
 from polarguide.runs import train as training
 from polarguide.runs.folder import MOST_GAUSSIANS, resolve

@@ -17,7 +17,7 @@ from polarguide.capture.scene import chosen_views, far_from_training
 from polarguide.core.options import SceneOptions
 from polarguide.core.progress import Reporter
 from polarguide.core.system import MemoryBound
-from polarguide.recipes import RECIPES, recipe_named
+from polarguide.methods import RECIPES, recipe_named
 from polarguide.runs import callbacks as observers
 from polarguide.runs import train as training
 from polarguide.runs.callbacks import TrainingStopped

@@ -12,9 +12,9 @@ from trainings import make_trainer
 
 from polarguide import optics
 from polarguide.capture import Scene
+from polarguide.methods import recipe_named
 from polarguide.raster import choose_backend
 from polarguide.raster.surface import surface_picture
-from polarguide.recipes import recipe_named
 from polarguide.results.export.adapters import INDEX_NOTE, page_shading, ply_fields
 from polarguide.shading.deferred import DeferredShading
 from polarguide.shading.gbuffer import RenderRequest, render, single_colors, splatting

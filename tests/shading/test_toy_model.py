@@ -17,7 +17,7 @@ from polarguide.capture import Scene
 from polarguide.capture.presentation import Crop, Presentation
 from polarguide.gaussians.ply import read_ply
 from polarguide.geometry.scene_frame import scene_frame
-from polarguide.recipes import recipe_named
+from polarguide.methods import recipe_named
 from polarguide.results.evaluation.scores import score_view
 from polarguide.results.evaluation.target import ViewTarget
 from polarguide.results.export.adapters import ply_fields

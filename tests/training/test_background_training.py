@@ -8,8 +8,8 @@ from faults import Fault
 from trainings import CPU, make_trainer, run
 
 from polarguide.capture import Scene
+from polarguide.methods import RECIPES
 from polarguide.raster import Backend, rasterize_reference
-from polarguide.recipes import RECIPES
 from polarguide.shading.gbuffer import RenderRequest, render, splats
 from polarguide.training.callbacks import LEAST_PIXELS, touched_pixels
 from polarguide.training.loop import TrainingLoop

@@ -15,7 +15,7 @@ from trainings import different
 import polarguide
 from polarguide.capture import Scene
 from polarguide.core.options import SessionOptions
-from polarguide.recipes import RECIPES
+from polarguide.methods import RECIPES
 from polarguide.runs.callbacks import TrainingStopped
 from polarguide.runs.folder import CHECKPOINT
 from polarguide.runs.train import train_gaussians

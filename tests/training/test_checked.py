@@ -19,7 +19,7 @@ from trainings import context_of
 import polarguide
 from polarguide.capture import Scene
 from polarguide.core.options import SceneOptions, SessionOptions
-from polarguide.recipes import RECIPES
+from polarguide.methods import RECIPES
 from polarguide.runs.folder import CHECKPOINT, load_checkpoint
 from polarguide.training.checked import refuse_foreign
 from polarguide.training.recipe import Recipe

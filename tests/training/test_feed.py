@@ -10,7 +10,7 @@ import torch
 from trainings import different, make_trainer, run, trained
 
 from polarguide.capture import Scene
-from polarguide.recipes import RECIPES
+from polarguide.methods import RECIPES
 from polarguide.runs.folder import load_checkpoint, save_checkpoint
 from polarguide.training import storage
 from polarguide.training.feed import (

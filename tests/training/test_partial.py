@@ -14,8 +14,8 @@ from polarguide import optics
 from polarguide.capture import Scene, View
 from polarguide.capture.exposures import FOUR, PLAIN, Exposure
 from polarguide.geometry.camera import Camera, look_at
+from polarguide.methods import RECIPES
 from polarguide.optics import Mount
-from polarguide.recipes import RECIPES
 from polarguide.shading.deferred import DeferredShading
 from polarguide.shading.gbuffer import render
 from polarguide.shading.result import RenderResult

@@ -16,8 +16,8 @@ from trainings import context_of
 import polarguide
 from polarguide.capture import load_scene
 from polarguide.core.options import SceneOptions
+from polarguide.methods import RECIPES
 from polarguide.raster.cpu import rasterize_cpu
-from polarguide.recipes import RECIPES
 from polarguide.runs.callbacks import TrainingStopped
 from polarguide.runs.folder import CHECKPOINT
 from polarguide.training.feed import Feed

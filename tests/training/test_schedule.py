@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from faults import Fault
 
-from polarguide.recipes import RECIPES
+from polarguide.methods import RECIPES
 from polarguide.training.recipe import Recipe, Repeat, Rounds, Schedule, Stage
 from polarguide_bench.recipes import ABLATIONS, recipe_named
 

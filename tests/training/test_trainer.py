@@ -12,7 +12,7 @@ from trainings import different, make_trainer, run, trained
 
 from polarguide.capture import Scene
 from polarguide.geometry.camera import Camera
-from polarguide.recipes import RECIPES
+from polarguide.methods import RECIPES
 from polarguide.runs.folder import load_checkpoint, save_checkpoint
 from polarguide.runs.model import GaussianModel
 from polarguide.shading.directional import DirectionalShading

@@ -11,7 +11,7 @@ from trainings import CPU, different, make_trainer, run
 
 from polarguide.capture import Scene
 from polarguide.gaussians.ply import read_ply
-from polarguide.recipes import RECIPES
+from polarguide.methods import RECIPES
 from polarguide.runs.folder import CHECKPOINT, load_checkpoint, save_checkpoint
 from polarguide.runs.model import write_run_ply
 from polarguide.training.callbacks import NormalOrientation

@@ -8,9 +8,9 @@ import torch
 from trainings import make_trainer, run
 
 from polarguide.capture import Scene
+from polarguide.methods import RECIPES
 from polarguide.raster import Backend, Rasterized, choose_backend
 from polarguide.raster.cuda import has_gsplat
-from polarguide.recipes import RECIPES
 from polarguide.runs.folder import load_checkpoint, resolve, save_checkpoint
 from polarguide.training.recipe import Recipe
 from polarguide.training.settings import TrainSettings

@@ -8,7 +8,7 @@ from trainings import different, trained
 
 from polarguide import optics
 from polarguide.capture import Scene, View
-from polarguide.recipes import RECIPES, recipe_named
+from polarguide.methods import RECIPES, recipe_named
 from polarguide_bench.recipes import ablations_of
 
 STEPS = 30

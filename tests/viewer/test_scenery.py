@@ -14,8 +14,8 @@ from viewer_scenes import frame_of_scene, photograph, shown
 
 from polarguide.capture import Scene
 from polarguide.capture.presentation import Crop, Presentation
+from polarguide.methods import recipe_named
 from polarguide.raster.magnification import footprints
-from polarguide.recipes import recipe_named
 from polarguide.shading.result import LAYERS, POLARIZED
 from polarguide.viewer.scenery import (
     BESIDE,

@@ -75,7 +75,7 @@ def run_folder(
     TrainSettings(steps=steps)
     SceneOptions(downscale=1 if downscale is None else downscale)
     if recipe is not None:
-        importlib.import_module("polarguide.recipes").recipe_named(recipe)
+        importlib.import_module("polarguide.methods").recipe_named(recipe)
     scene = source if posed else folder / "scene"
     commands = [
         ["prepare", str(source), "--out", str(scene), *preparation, *machine],

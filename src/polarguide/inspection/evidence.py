@@ -41,8 +41,8 @@ from polarguide.core.records import read_record
 from polarguide.geometry.camera import Camera
 from polarguide.geometry.vectors import dot, unit
 from polarguide.inspection.capture import InspectedView
+from polarguide.methods import recipe_named
 from polarguide.raster import Backend
-from polarguide.recipes import recipe_named
 from polarguide.runs.folder import CHECKPOINT, load_checkpoint, resolve, save_checkpoint
 from polarguide.shading.gbuffer import RenderRequest, render
 from polarguide.training.angles.fits import gaussian_training

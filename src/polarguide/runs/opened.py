@@ -22,8 +22,8 @@ from polarguide.core.progress import SILENT, Reporter
 from polarguide.core.text import command
 from polarguide.geometry.camera import Camera
 from polarguide.geometry.scene_frame import SceneFrame, scene_frame
+from polarguide.methods import recipe_named
 from polarguide.raster import choose_backend
-from polarguide.recipes import recipe_named
 from polarguide.runs.folder import CONFIGURATION, RunConfiguration, load_checkpoint, writing_to
 from polarguide.runs.health import Health
 from polarguide.runs.model import GaussianModel, Within

@@ -20,8 +20,8 @@ from polarguide.core.options import PathLike, SceneOptions, SessionOptions
 from polarguide.core.progress import SILENT, Reporter
 from polarguide.core.records import first_differing_value
 from polarguide.core.system import MemoryBound, return_freed_memory
+from polarguide.methods import recipe_named
 from polarguide.raster import Backend, choose_backend, use_threads
-from polarguide.recipes import recipe_named
 from polarguide.runs.callbacks import Ends, Look, run_to_the_end
 from polarguide.runs.folder import (
     CHECKPOINT,

@@ -17,7 +17,7 @@ from polarguide.capture import Scene, View
 from polarguide.capture.angle_evidence import mean_angle
 from polarguide.capture.exposures import FOUR, Exposure, read_table
 from polarguide.capture.variants import select_exposures
-from polarguide.recipes import RECIPES, recipe_named
+from polarguide.methods import RECIPES, recipe_named
 from polarguide.runs.health import report_polarizers
 from polarguide.training.angles.fits import gaussian_training
 from polarguide.training.angles.polarizers import Polarizers

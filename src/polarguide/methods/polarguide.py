@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 
-from polarguide.recipes.baselines import RECIPE_3DGS_DR, SHADING_3DGS_DR
+from polarguide.methods.baselines import RECIPE_3DGS_DR, SHADING_3DGS_DR
 from polarguide.training.recipe import Action, Priors, Recipe, Repeat, Stage, Weights
 
 REFRESH = Repeat("refresh_priors", fraction=0.1, minimum=250)

@@ -16,8 +16,8 @@ from functools import lru_cache
 from importlib.metadata import EntryPoint, entry_points
 
 from polarguide.core.errors import PolarguideError, require
-from polarguide.recipes.baselines import RECIPE_3DGS, RECIPE_3DGS_DR, RECIPE_REF_GS
-from polarguide.recipes.polarguide import (
+from polarguide.methods.baselines import RECIPE_3DGS, RECIPE_3DGS_DR, RECIPE_REF_GS
+from polarguide.methods.polarguide import (
     RECIPE_POLARGUIDE,
     RECIPE_POLARGUIDE_PAPER,
     RECIPE_POLARGUIDE_PAPER_KIND,
