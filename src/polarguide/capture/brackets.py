@@ -69,19 +69,21 @@ class Bracket:
         """Find all exposures of the shots that some files represent.
 
         Raises:
-            PolarguideError: the shots have different exposures.
+            PolarguideError: the shots have different exposures, or names or the table state no normal exposure.
         """
         brackets = [exposure_files(path) for path in paths]
+        for files in brackets:
+            _require_normal(files)
         if all(len(files) == 1 for files in brackets):
             return cls((tuple(paths),), (0.0,))
         stated = [_stated_stops(files) for files in brackets]
         for path, files, stops in zip(paths, brackets, stated, strict=True):
             require(
-                len(files) == len(brackets[0]) and (stops is None) == (stated[0] is None),
+                len(files) == len(brackets[0]) and _are_alike(stops, stated[0]),
                 path,
-                expected=f"{len(brackets[0])} exposures like {paths[0].name}",
-                found=", ".join(file.name for file in files),
-                remedy="Add the missing files, or remove this exposure of all shots of the view.",
+                expected=f"{len(brackets[0])} exposures like {paths[0].name} ({_stops_text(stated[0])})",
+                found=f"{', '.join(file.name for file in files)} ({_stops_text(stops)})",
+                remedy="Add the missing files, correct the stops, or remove this exposure of all shots of the view.",
             )
         if stated[0] is None:
             return cls(tuple(zip(*brackets, strict=True)), None)
@@ -105,6 +107,38 @@ class Bracket:
 
 SINGLE = Bracket(((),), (0.0,))
 """One exposure of shots in memory."""
+
+
+def _require_normal(files: Sequence[Path]) -> None:
+    """Check that one exposure of a shot is the normal one, if names or the table state the stops of all of them.
+
+    Raises:
+        PolarguideError: all stated stops differ from 0.
+    """
+    named = [exposure_name(file).stops for file in files]
+    stops = [value for value in named if value is not None]
+    require(
+        len(stops) < len(files) or min(map(abs, stops)) < OTHER_EXPOSURE,
+        files[0],
+        expected="a normal exposure of the shot, which has 0 stops",
+        found=_stops_text(stops),
+        remedy="Add the normal exposure, or correct the stops in the names or in exposures.csv.",
+    )
+
+
+def _are_alike(stops: Sequence[float] | None, others: Sequence[float] | None) -> bool:
+    """Return True if two shots have the same exposures in any order, or state none."""
+    if stops is None or others is None:
+        return stops is others
+    pairs = zip(sorted(stops), sorted(others), strict=True)
+    return all(abs(stop - other) < OTHER_EXPOSURE for stop, other in pairs)
+
+
+def _stops_text(stops: Sequence[float] | None) -> str:
+    """Format the exposures of a shot for an error message, the longest first."""
+    if stops is None:
+        return "stops not stated"
+    return f"{', '.join(f'{stop:+.2f}' for stop in sorted(stops, reverse=True))} stops"
 
 
 def _stated_stops(files: Sequence[Path]) -> list[float] | None:
