@@ -15,8 +15,8 @@ from torch import Tensor
 
 from polarguide.capture import checks
 from polarguide.capture.calibration import ANGLES, Calibration
+from polarguide.capture.brackets import Bracket
 from polarguide.capture.develop import COMPARABLE, levels_of_shot, require_one, stated_exposures
-from polarguide.capture.exposure_files import exposure_files
 from polarguide.capture.exposures import Angle, Exposure, analyzers, turned
 from polarguide.capture.filter.camera_files import apply_orientation, orientation_calibration
 from polarguide.capture.filter.encoding import VIDEO, kind_of_file, transfer_of_pictures
@@ -58,11 +58,12 @@ def read_set(name: str, pictures: Sequence[SetPicture], options: ShotOptions) ->
         COMPARABLE,
     )
     for picture in known:
+        bracket = Bracket.of([picture.path])
         require(
-            len(exposure_files(picture.path)) == 1,
+            bracket.single,
             picture.path,
             expected="one exposure of each picture of a set at any angles",
-            found=f"{len(exposure_files(picture.path))} exposures",
+            found=f"{len(bracket.files)} exposures",
             remedy="Use pictures at 0, 45, 90 and 135 degrees, or polarguide prepare, which merges exposures.",
         )
     stack = _stack(name, known[0].path, len(known), _read_each(known))

@@ -417,27 +417,37 @@ _EQUAL = 1e-3
 def light_of_files(
     views: Mapping[str, Sequence[Path]], advance: Advance | None = None
 ) -> tuple[dict[Path, float], str]:
-    """Read the exposure of each file from its EXIF tags.
+    """Read the exposure of each shot from EXIF tags.
+
+    The exposures of a bracket become one value: the exposure at which the merged radiance 1 is full scale.
 
     Args:
-        views: files of each view.
+        views: files of each view, which represent its shots.
         advance: callback for the number of views that were read.
 
     Returns:
-        The exposures of the files that state an exposure; and a warning, or "". If some files lack a tag that others
+        The exposures of the shots whose files state an exposure; and a warning, or "". If some files lack a tag that others
         have, exposures cannot be compared. The result is then empty, and the warning names the missing tags.
 
     Raises:
-        PolarguideError: a file cannot be read.
+        PolarguideError: a file cannot be read, or the shots of a view have different exposures.
     """
     taken: dict[Path, ExposureData] = {}
+    scales: dict[Path, tuple[Path, float]] = {}
     for number, paths in enumerate(views.values(), 1):
-        taken |= {path: read_exposure_data(path) for path in paths}
+        bracket = Bracket.of(paths)
+        taken |= {file: read_exposure_data(file) for files in bracket.files for file in files}
+        scale = 2.0 ** -(bracket.stops or (0.0,))[bracket.normal]
+        scales |= {
+            path: (file, scale) for path, file in zip(paths, bracket.files[bracket.normal], strict=True)
+        }
         if advance is not None:
             advance(number)
     missing = missing_tags(taken)
-    stating = {} if missing else taken
-    return {path: light for path, data in stating.items() if (light := data.light) is not None}, missing
+    if missing:
+        return {}, missing
+    stated = {path: (taken[file].light, scale) for path, (file, scale) in scales.items()}
+    return {path: light * scale for path, (light, scale) in stated.items() if light is not None}, ""
 
 
 def stated_exposures(
