@@ -195,6 +195,18 @@ def keeps_gains(path: Path, data: bytes) -> bool:
     return isinstance(settings, dict) and settings.get("gains") == "none"
 
 
+def merges_exposures(path: Path, data: bytes) -> bool:
+    """Return True if the scene was prepared from exposure brackets, so most pixels may be above full scale.
+
+    Args:
+        path: path of ``scene.json`` for messages.
+        data: its content.
+    """
+    prepared = decode(data, _Scene, path, remedy="Prepare the scene again.").prepare
+    measured = prepared.get("measured") if isinstance(prepared, dict) else None
+    return isinstance(measured, dict) and measured.get("bracketed") is True
+
+
 def applied_calibration(path: Path, data: bytes) -> Calibration | None:
     """Return the order, sense and zero that ``prepare`` and ``inspect --fix`` applied to the pictures of a scene.
 

@@ -27,9 +27,10 @@ from polarguide.capture.formats.pictures import (
     decode_picture,
     linear_codes,
     read_picture,
+    require_full_scale,
 )
 from polarguide.capture.layout import CaptureFiles
-from polarguide.capture.metadata import GroundTruth, read_ground_truth
+from polarguide.capture.metadata import GroundTruth, merges_exposures, read_ground_truth
 from polarguide.capture.point_exposures import ComparedPoints, PointExposures, PointSamples
 from polarguide.capture.view import EVEN, FULL_CODE, Latest, Loader, View
 from polarguide.core.errors import PolarguideError, require
@@ -347,7 +348,7 @@ class ViewFiles:
     def _read_codes(self, name: str) -> Tensor:
         return torch.from_numpy(
             _codes(
-                _read_pictures(Files(self._digests), self._layout.files(name), self._transfer),
+                _read_pictures(Files(self._digests), self._layout, name, self._transfer),
                 self._transfer,
                 self._factor,
             )
@@ -388,7 +389,7 @@ def read_view(
         PolarguideError: a file is damaged, or the sizes of the files differ.
     """
     files = Files()
-    raw = _read_pictures(files, layout.files(name), transfer)
+    raw = _read_pictures(files, layout, name, transfer)
     height, width = raw[0].shape[:2]
     require_factor(factor, height, width)
     optional = {
@@ -504,12 +505,13 @@ def _codes(raw: Sequence[NDArray[Any]], transfer: str, factor: int) -> NDArray[A
     return np.stack([boxes.mean_codes(linear_codes(pixels, transfer), factor) for pixels in raw])
 
 
-def _read_pictures(files: Files, paths: list[Path], transfer: str) -> list[NDArray[Any]]:
+def _read_pictures(files: Files, layout: CaptureFiles, name: str, transfer: str) -> list[NDArray[Any]]:
     """Read the pictures of a view, [H, W, 3] each, and check that they have the same size and bit depth.
 
     Floating-point pictures are linear radiance if one of them has values above 1. Otherwise they become 16-bit codes,
-    whose largest value marks saturated pixels.
+    whose largest value marks saturated pixels. The median may exceed 1 only if ``prepare`` merged exposures.
     """
+    paths = layout.files(name)
     pictures: list[NDArray[Any]] = []
     for path in paths:
         data = files.picture(path)
@@ -523,6 +525,10 @@ def _read_pictures(files: Files, paths: list[Path], transfer: str) -> list[NDArr
         return pictures
     if all(picture.max() <= 1 for picture in pictures):
         return [codes_of_floats(picture) for picture in pictures]
+    scene = layout.root / "scene.json"
+    if not (scene.exists() and merges_exposures(scene, read_file(scene, largest=LARGEST_RECORD))):
+        for path, picture in zip(paths, pictures, strict=True):
+            require_full_scale(path, picture)
     require(
         transfer == "linear",
         paths[0],

@@ -164,7 +164,8 @@ def read_capture(
     text = read_file(metadata, largest=LARGEST_RECORD) if metadata.exists() else b"{}"
     first = layout.files(names[0])[0]
     factor = downscale or max(
-        1, math.ceil(max(decode_picture(first, read_picture(first)).shape[:2]) / LONGEST)
+        1,
+        math.ceil(max(decode_picture(first, read_picture(first), keep_floats=True).shape[:2]) / LONGEST),
     )
     stored = read_views(layout, names, model, downscale=factor, transfer=transfer, reporter=reporter)
     lines = sorted(f"{p.relative_to(root)} {d}" for item in stored.data for p, d in item.digests.items())

@@ -341,8 +341,12 @@ def decode_picture(path: Path, data: bytes, *, keep_floats: bool = False) -> NDA
     pixels = decode_stored(path, data)
     full = stated_full_scale(path, io.BytesIO(data), pixels)
     if pixels.dtype.kind == "f":
-        _require_unit_floats(path, pixels)
-        pixels = np.maximum(pixels, 0).astype(np.float32) if keep_floats else codes_of_floats(pixels)
+        _require_finite(path, pixels)
+        if keep_floats:
+            pixels = np.maximum(pixels, 0).astype(np.float32)
+        else:
+            require_full_scale(path, pixels)
+            pixels = codes_of_floats(pixels)
     elif full is not None:
         pixels = rescaled(pixels, full)
     require(
@@ -365,15 +369,32 @@ def decode_picture(path: Path, data: bytes, *, keep_floats: bool = False) -> NDA
     return np.ascontiguousarray(pixels[..., 2::-1])
 
 
-def _require_unit_floats(path: Path, pixels: NDArray[Any]) -> None:
+_UNIT_FLOATS = "floating-point values from 0 to 1, where 1 is full scale"
+_DIVIDE = "Divide by the value at which the camera saturates, or save 16-bit whole numbers."
+
+
+def _require_finite(path: Path, pixels: NDArray[Any]) -> None:
     require(
-        np.isfinite(pixels).all() and float(np.median(pixels)) <= 1.0,
+        bool(np.isfinite(pixels).all()),
         path,
-        expected="floating-point values from 0 to 1, where 1 is full scale",
-        found="values that are not finite"
-        if not np.isfinite(pixels).all()
-        else f"up to {float(pixels.max()):g}",
-        remedy="Divide by the value at which the camera saturates, or save 16-bit whole numbers.",
+        expected=_UNIT_FLOATS,
+        found="values that are not finite",
+        remedy=_DIVIDE,
+    )
+
+
+def require_full_scale(path: Path, pixels: NDArray[Any]) -> None:
+    """Check that floating-point values have the full scale 1. Their median is then at most 1.
+
+    Raises:
+        PolarguideError: most values exceed 1.
+    """
+    require(
+        float(np.median(pixels)) <= 1.0,
+        path,
+        expected=_UNIT_FLOATS,
+        found=f"up to {float(pixels.max()):g}",
+        remedy=_DIVIDE,
     )
 
 
