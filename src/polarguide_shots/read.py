@@ -28,6 +28,7 @@ from polarguide.capture.develop import (
     pair_gains,
     sample_blocks,
 )
+from polarguide.capture.exposure_files import all_exposures
 from polarguide.capture.exposures import FOUR, Angle, normalized
 from polarguide.capture.filter.camera_files import apply_orientation
 from polarguide.capture.filter.develop import moved_shots
@@ -723,9 +724,10 @@ def _four(shot: ExposureSet, levels: Levels | None = None) -> BracketedShots:
     """
     if shot.stored is not None:
         return BracketedShots.single(stacked(shot.stored, levels=levels))
+    files = list(shot.files.values())
     require_memory_of_each(
-        list(shot.files.values()),
-        _READ,
+        files,
+        _READ * len(all_exposures(files)) // len(files),
         "four shots",
         remedy="Make the pictures smaller, all by the same factor.",
     )

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polarguide.capture.exposure_files import all_exposures, list_shot_files, shot_stem
+from polarguide.capture.exposure_files import all_exposures, exposure_tables, list_shot_files, shot_stem
 from polarguide.capture.exposures import (
     FEWEST,
     LARGEST,
@@ -105,12 +105,12 @@ class ExposureSet:
     def paths(self) -> tuple[Path, ...]:
         """All files of the shot: pictures by angle, then the table of a set. Empty for a shot in memory.
 
-        Further exposures of the pictures are at the end.
+        Further exposures of the pictures and the table of exposures are at the end.
         """
         pictures = [path for _, path in sorted(self.files.items())]
         pictures += dict.fromkeys(picture.path for picture in self.pictures)
         table = [] if self.table is None else [self.table]
-        bracketed = all_exposures(pictures) if self.root is None else []
+        bracketed = [] if self.root is not None else [*all_exposures(pictures), *exposure_tables(pictures)]
         return tuple(dict.fromkeys((*pictures, *table, *self.others, *bracketed)))
 
     @property

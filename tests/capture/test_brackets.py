@@ -26,14 +26,19 @@ from PIL import Image
 
 from polarguide.capture.brackets import Bracket, Radiance, measure_exposures
 from polarguide.capture.brackets import merge as merge_measured
+from polarguide.capture.develop import light_of_files
 from polarguide.capture.exposure_files import exposure_name, list_shot_files
-from polarguide.capture.layout import find_layout
+from polarguide.capture.formats.pictures import linear_codes
+from polarguide.capture.layout import SHARE, find_layout
+from polarguide.capture.point_exposures import PointSamples
 from polarguide.capture.view_reader import StoredViews, ViewData, read_view
 from polarguide.core.progress import Reporter
 from polarguide.geometry.polarizer import ANGLES, malus
 from polarguide.inspection.capture import read_capture
 from polarguide.inspection.inspect import measure_view
 from polarguide.inspection.picture_checks import light_checks
+from polarguide.preparation import filter_source
+from polarguide.preparation.journal import ExposureRecord
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import PrepareSettings
 from polarguide_shots.exposures import find_shots
@@ -101,6 +106,10 @@ def bracket(stops: tuple[float, ...] | None, count: int = 3) -> Bracket:
         ("cup-EV+1.5.png", "cup", 1.5),
         ("v01_ev0.png", "v01", 0.0),
         ("v01_bracket2.png", "v01", None),
+        ("v01_bracket12.png", "v01", None),
+        ("steel_bracket_000.png", "steel_bracket_000", None),
+        ("steel_bracket_5.png", "steel_bracket_5", None),
+        ("steel-bracket045.png", "steel-bracket045", None),
         ("v01.png", "v01", None),
         ("eve.png", "eve", None),
         ("ev3.png", "ev3", None),
@@ -297,12 +306,31 @@ def test_a_table_names_shots_and_exposures(tmp_path: Path) -> None:
         ("file,shot,stops\na.png,a,x\n", Fault("(line 2)", "stops up to 20")),
         ("file,shot,stops\na.png,a,99\n", Fault("(line 2)", "stops up to 20")),
         ("file,shot,stops\na.png,a,0\na.png,b,0\n", Fault("(line 3)", "listed once")),
+        ("file,shot,stops\na.png,a,0\nb.png,a,-3\n", Fault("(line 3)", "b.png", "nothing with this name")),
     ],
 )
 def test_tables_that_are_refused(tmp_path: Path, rows: str, fault: Fault) -> None:
     (tmp_path / "exposures.csv").write_text(rows)
     (tmp_path / "a.png").touch()
     fault.raised_by(list_shot_files, tmp_path, (".png",))
+
+
+def test_a_missing_file_of_the_table_may_arrive_and_disappear(tmp_path: Path) -> None:
+    write_table(tmp_path, ["a.png,shot,0", "b.png,shot,-3"])
+    missing = Fault("(line 3)", "b.png", "nothing with this name")
+    (tmp_path / "a.png").touch()
+    missing.raised_by(list_shot_files, tmp_path, (".png",))
+    (tmp_path / "b.png").touch()
+    assert list_shot_files(tmp_path, (".png",)) == [tmp_path / "a.png"]
+    (tmp_path / "b.png").unlink()
+    missing.raised_by(list_shot_files, tmp_path, (".png",))
+
+
+def test_objects_named_bracket_are_four_shots(tmp_path: Path) -> None:
+    paths = [tmp_path / f"steel_bracket_{angle:03d}.png" for angle in ANGLES]
+    for path in paths:
+        path.touch()
+    assert list_shot_files(tmp_path, (".png",)) == paths
 
 
 def spoil_label(root: Path) -> None:
@@ -357,6 +385,148 @@ def test_an_exposure_that_one_shot_lacks_is_refused(tmp_path: Path) -> None:
     write_bracketed_shots(tmp_path / "shots", "cup")
     (tmp_path / "shots" / "cup_90_ev-6.png").unlink()
     Fault("cup_90_ev0.png", "3 exposures like").raised_by(prepared, tmp_path / "shots", SHOTS)
+
+
+def test_shots_with_other_stops_are_refused(tmp_path: Path) -> None:
+    write_bracketed_shots(tmp_path / "shots", "cup")
+    (tmp_path / "shots" / "cup_90_ev-3.png").rename(tmp_path / "shots" / "cup_90_ev-2.png")
+    Fault("cup_90_ev0.png", "+0.00, -3.00, -6.00 stops", "+0.00, -2.00, -6.00 stops").raised_by(
+        prepared, tmp_path / "shots", SHOTS
+    )
+
+
+@pytest.mark.parametrize("stops", [(-3.0,), (-3.0, -6.0), (1.0,), (1.0, -3.0)])
+def test_a_shot_without_its_normal_exposure_is_refused(tmp_path: Path, stops: tuple[float, ...]) -> None:
+    write_bracket(tmp_path / "raw", "v", stops=stops)
+    fault = Fault("v_ev", "0 stops", f"{stops[0]:+.2f}")
+    fault.raised_by(prepared, tmp_path / "raw", MOSAIC)
+    (shot,) = find_shots([tmp_path / "raw"], OPTIONS)
+    fault.raised_by(read_shot, shot, OPTIONS)
+
+
+def test_a_table_without_a_normal_exposure_is_refused(tmp_path: Path) -> None:
+    write_bracket(tmp_path / "raw", "x", stops=(-3.0,), names=("IMG_1",))
+    write_table(tmp_path / "raw", ["x_IMG_1.png,part,-3"])
+    Fault("x_IMG_1.png", "0 stops", "-3.00 stops").raised_by(prepared, tmp_path / "raw", MOSAIC)
+
+
+@pytest.mark.parametrize(
+    ("stops", "names"),
+    [
+        ((0.0, -3.0), None),
+        # The scale is that of 0 stops, even if the nearest exposure deviates.
+        ((0.125, -3.0), None),
+        # The first file is not the longest exposure, which defines the scale.
+        ((-3.0, 0.0), ("bracket1", "bracket2")),
+    ],
+)
+def test_the_light_of_a_shot_belongs_to_the_scale_of_its_values(
+    tmp_path: Path, stops: tuple[float, ...], names: tuple[str, ...] | None
+) -> None:
+    root = tmp_path / "shots"
+    write_bracketed_shots(root, "cup", stops, names, ".jpg", angles=(30,), seconds=0.5)
+    write_bracketed_shots(root, "jar", stops, names, ".jpg", angles=(75,), seconds=0.25)
+    files = list_shot_files(root, (".jpg",))
+    stated, missing = light_of_files({path.name[:3]: [path] for path in files})
+    assert not missing
+    np.testing.assert_allclose([stated[path] for path in files], [50, 25], rtol=1e-3)  # ISO 100
+    prepared(root, replace(SHOTS, transfer="srgb", gains="exif"))
+    gains = [line.split(",")[-1] for line in (tmp_path / "scene" / "angles.csv").read_text().split()[1:]]
+    np.testing.assert_allclose(float(gains[0]) / float(gains[1]), 2, rtol=1e-3)
+
+
+def test_a_bracket_that_states_the_light_of_one_exposure_corrects_nothing(tmp_path: Path) -> None:
+    names = ("bracket1", "bracket2")
+    paths = write_bracketed_shots(tmp_path, "cup", (-3, 0), names, ".jpg", angles=(30,), seconds=1)
+    with Image.open(paths[1]) as picture:
+        picture.save(tmp_path / "plain.jpg", quality=95)
+    (tmp_path / "plain.jpg").replace(paths[1])
+    stated, missing = light_of_files({"cup": paths[:1]})
+    assert stated == {}
+    assert "1 of 2 files have no ExposureTime" in missing
+
+
+def test_most_of_a_radiance_may_exceed_full_scale(tmp_path: Path) -> None:
+    stokes = 8 * bright_light()
+    stokes[:, :, :32] /= 8
+    write_bracket(tmp_path / "raw", "v", stokes)
+    data, _ = prepared(tmp_path / "raw", MOSAIC)
+    assert np.median(data.codes) > 65535
+    np.testing.assert_allclose(np.median(s0_of(data) / halved(stokes[0].mean(-1))), 1, atol=0.01)
+    assert read_capture(tmp_path / "scene").views[0].codes.dtype == torch.float32
+    # Without the record of merged exposures, such numbers may have any unit.
+    (tmp_path / "scene" / "scene.json").unlink()
+    Fault("v_", "1 is full scale").raised_by(
+        read_view, find_layout(tmp_path / "scene"), "v", factor=1, transfer="linear"
+    )
+
+
+class BrightPoints:
+    """Points at the brightest pixel of each of two views."""
+
+    places = np.random.default_rng(2).normal(size=(200, 3))
+    observed = np.ones((200, 2), bool)
+
+    def samples(self, _view: str, stored: list[np.ndarray], _bad: np.ndarray, transfer: str) -> PointSamples:
+        values = [linear_codes(picture, transfer).max() / 65535 for picture in stored]
+        return PointSamples(np.tile(np.array(values)[None, :, None], (200, 1, 3)), np.zeros(200, np.int64))
+
+
+def test_gains_compare_highlights_of_a_radiance(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for folder in ("polar", "invalid"):
+        (tmp_path / folder).mkdir()
+    for view, value in (("a", 2.0), ("b", 4.0)):
+        picture = np.full((8, 8, 3), 0.5, np.float32)
+        picture[4, 4] = value
+        tifffile.imwrite(tmp_path / "polar" / f"{view}.tif", picture, photometric="rgb")
+        assert cv2.imwrite(str(tmp_path / "invalid" / f"{view}.png"), np.zeros((8, 8), np.uint8))
+    monkeypatch.setattr(filter_source, "read_model", lambda root: None)
+    monkeypatch.setattr(filter_source.ComparedPoints, "of", lambda model, views: BrightPoints())
+    records = [ExposureRecord(view, 0.0, None, None) for view in "ab"]
+    rows = [
+        filter_source.PictureRow(view, f"{view}.tif", record)
+        for view, record in zip("ab", records, strict=True)
+    ]
+    compared = filter_source._compare_points(tmp_path, rows, {"a": [0], "b": [1]}, np.zeros(2), Notes())
+    assert compared is not None
+    assert compared.logs[1, 0] - compared.logs[0, 0] == pytest.approx(np.log(2), abs=1e-3)
+
+
+def corrects_the_table(root: Path, settings: PrepareSettings, suffix: str) -> None:
+    """Prepare a capture with a table, correct the table, and check that a second call notices the change."""
+    files = [path for path in sorted(root.iterdir()) if path.suffix == suffix]
+    rows = [f"{path.name},{path.stem.rpartition('_')[0]}," for path in files]
+    write_table(root, rows)
+    prepared(root, settings)
+    assert not prepare_scene(root, root.parent / "scene", settings).new
+    write_table(root, [f"{row}{-3 if 'e2' in row else 0}" for row in rows])
+    Fault("scene", "exposures.csv").raised_by(prepare_scene, root, root.parent / "scene", settings)
+
+
+def test_a_corrected_table_is_noticed_by_prepare(tmp_path: Path) -> None:
+    write_bracket(tmp_path / "mosaic" / "raw", "v", stops=(0.0, -3.0), names=("e1", "e2"))
+    corrects_the_table(tmp_path / "mosaic" / "raw", MOSAIC, ".png")
+    for name, angles in (("four", ANGLES), ("single", (30,))):
+        write_bracketed_shots(tmp_path / name / "raw", "v", (0.0, -3.0), ("e1", "e2"), angles=angles)
+        corrects_the_table(tmp_path / name / "raw", SHOTS, ".png")
+
+
+def test_the_table_is_a_file_of_a_shot(tmp_path: Path) -> None:
+    paths = write_bracket(tmp_path / "raw", "x", stops=(0.0, -3.0), names=("e1", "e2"))
+    write_table(tmp_path / "raw", ["x_e1.png,part,0", "x_e2.png,part,-3"])
+    (shot,) = find_shots([tmp_path / "raw"], OPTIONS)
+    assert shot.paths == (*paths, tmp_path / "raw" / "exposures.csv")
+
+
+def test_all_exposures_of_four_shots_count_in_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_bracketed_shots(tmp_path / "shots", "cup")
+    options = ShotOptions(transfer="linear", gains="none")
+    (shot,) = find_shots([tmp_path / "shots"], options)
+    height, width = SIZE
+    # Enough for two exposures of four shots.
+    free = 2 * 4 * 3 * (2 + 2) * height * width / SHARE
+    monkeypatch.setattr("polarguide.capture.layout.free_memory", lambda: int(free))
+    Fault("cup_0_ev0.png", "pictures that take up to", "four shots").raised_by(read_shot, shot, options)
 
 
 def agrees(dolp: np.ndarray, usable: np.ndarray) -> None:

@@ -33,7 +33,7 @@ from polarguide.capture.develop import (
     require_one,
     stated_exposures,
 )
-from polarguide.capture.exposure_files import all_exposures
+from polarguide.capture.exposure_files import all_exposures, exposure_tables
 from polarguide.capture.exposures import TABLE, Angle, angle_text, turned
 from polarguide.capture.filter.camera_files import (
     Lens,
@@ -295,7 +295,8 @@ class FilterSource(ShotsSource):
             fault = f"{root} contains pictures without an angle in their names, or at other angles than 0, 45, 90, 135"
             warnings.warn(f"{fault}. They are not used ({listed(unused)}).", PolarguideWarning, stacklevel=2)
         views = {view: [files[angle] for angle in ANGLES] for view, files in sorted(shots.items())}
-        super().__init__(all_exposures([path for files in views.values() for path in files]), views, settings)
+        files = [path for paths in views.values() for path in paths]
+        super().__init__([*all_exposures(files), *exposure_tables(files)], views, settings)
 
     @property
     def description(self) -> str:
@@ -389,7 +390,8 @@ class SinglesSource(ShotsSource):
         for shot in shots:
             self._singles.setdefault(shot.view, []).append(shot)
         files = {view: [shot.path for shot in group] for view, group in sorted(self._singles.items())}
-        super().__init__([*all_exposures([*itertools.chain(*files.values())]), *tables], files, settings)
+        paths = [shot.path for shot in shots]
+        super().__init__([*all_exposures(paths), *exposure_tables(paths), *tables], files, settings)
 
     @property
     def description(self) -> str:
@@ -701,7 +703,7 @@ def _compare_points(
     with reporter.track("comparing exposures", len(views)) as advance:
         for column, view in enumerate(views):
             files = [root / "polar" / pictures[k].file for k in rows[view]]
-            stored = [decode_picture(path, read_picture(path)) for path in files]
+            stored = [decode_picture(path, read_picture(path), keep_floats=True) for path in files]
             path = root / "invalid" / f"{view}.png"
             samples = compared.samples(
                 view, stored, decode_mask(path, read_picture(path), any_value=True), "linear"

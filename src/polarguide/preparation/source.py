@@ -28,7 +28,7 @@ from polarguide.capture.develop import (
     pair_gains,
     sample_blocks,
 )
-from polarguide.capture.exposure_files import all_exposures, index_shot_files
+from polarguide.capture.exposure_files import all_exposures, exposure_tables, index_shot_files
 from polarguide.capture.exposures import Angle
 from polarguide.capture.filter.camera_files import INVERSE, QUARTER_TURNS, Lens, apply_orientation
 from polarguide.capture.formats.pictures import stated_size
@@ -435,7 +435,12 @@ class MosaicSource(Source):
         self._files = {view: files[view] for view in sorted(names)}
         self.views = list(self._files)
         self._brackets = {view: Bracket.of([path]) for view, path in self._files.items()}
-        self.paths = all_exposures(list(self._files.values())) if dataset is None else list(dataset.paths)
+        represented = list(self._files.values())
+        self.paths = (
+            [*all_exposures(represented), *exposure_tables(represented)]
+            if dataset is None
+            else list(dataset.paths)
+        )
         self.paths += [path for path in (settings.dark_frame, settings.analyzers) if path is not None]
         self._white = white_gains(settings.white_balance)
         self._defective: NDArray[np.bool_] | None = None

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from polarguide.capture.exposure_files import is_lone_exposure
 from polarguide.capture.formats.headers import find_damage
 from polarguide.capture.formats.pictures import SUFFIXES
 from polarguide.capture.sensor.raw_file import RAW_SUFFIXES
@@ -70,12 +71,16 @@ class _Folder:
         """Return all shots in the folder, including incomplete shots."""
         # An error may be temporary: the first of four folders, or a network that is down.
         try:
-            shots = self._search()
+            shots = [
+                shot
+                for shot in self._search()
+                if not any(os.path.realpath(path) in self.ignored for path in shot.paths)
+            ]
             self._error = ("", 0.0)
         except (PolarguideError, OSError) as error:
             shots = []
             self._keep(error)
-        return [shot for shot in shots if not any(os.path.realpath(p) in self.ignored for p in shot.paths)]
+        return shots
 
     def _search(self) -> list[ExposureSet]:
         if self.reading.sensor is None:
@@ -127,6 +132,7 @@ def watch_folder(
     A shot with fewer than four files waits. A warning follows after ``patience`` seconds, and the shot is in
     ``Outcome.waiting`` at the end. A set at other angles is measured when its angles are evenly spaced over half a turn
     or all files of ``angles.csv`` exist. If neither holds, it is measured after ``patience`` seconds without a change.
+    The same applies to a single exposure whose name states the stops, because further exposures may follow.
 
     A rewritten file is a new shot. If the process stops or is killed, the same call continues with the shots that are
     not in the table.
@@ -192,7 +198,7 @@ class _Watch:
         for shot in shots:
             try:
                 files = stamps(shot.paths)
-            except OSError:  # removed since the search
+            except (PolarguideError, OSError):  # a file was removed since the search
                 continue
             if self._line.table.entry_of(files) is not None:
                 continue
@@ -222,6 +228,8 @@ class _Watch:
             return late
         if shot.kind == "set" and not shot.complete:
             return late
+        if any(map(is_lone_exposure, shot.files.values())):  # further exposures may follow
+            return late
         if shot.kind != "filter" or not missing:
             return late or not state.truncated
         if late and not state.reported:
@@ -245,7 +253,7 @@ class _Watch:
             try:
                 changed = stamps(shot.paths) != state.files
                 state.truncated = not changed and not late and not all(map(_is_complete, shot.paths))
-            except OSError:
+            except (PolarguideError, OSError):
                 return None
             return None if changed or state.truncated else self._line.unread(shot, state.files, error)
 

@@ -13,6 +13,7 @@ import time
 from pathlib import Path
 
 import pytest
+from bracketed import write_bracket
 
 from polarguide.core.progress import Reporter
 from polarguide.geometry.polarizer import ANGLES
@@ -174,6 +175,23 @@ def test_what_is_ambiguous_gets_a_line_when_nothing_has_mended_it(tmp_path: Path
     (parts / "photo.png").unlink()
     assert watch_folder(parts, tmp_path / "out", reading=PLAIN, watching=watching).counts == {"measured": 1}
     assert watch_folder(parts, tmp_path / "out", reading=PLAIN, watching=watching).counts == {}
+
+
+def test_a_lone_exposure_waits_for_further_exposures(tmp_path: Path) -> None:
+    parts = tmp_path / "in"
+    bracket = write_bracket(tmp_path / "done", "part", stops=(0.0, -3.0))
+    parts.mkdir()
+    shutil.copy(bracket[1], parts)
+    reading = ShotOptions(sensor="IMX250MZR", black_level=64, bits=12, gains="none")
+    patient = WatchOptions(settle=0.1, patience=30, idle=0.3)
+    first = watch_folder(parts, tmp_path / "out", reading=reading, watching=patient)
+    assert (first.counts, first.waiting) == ({}, ("part",))
+    shutil.copy(bracket[0], parts)
+    assert watch_folder(parts, tmp_path / "out", reading=reading, watching=patient).counts == {"measured": 1}
+    (parts / bracket[1].name).unlink()
+    # A normal exposure alone is measured after the patience.
+    watching = WatchOptions(settle=0.1, patience=0.3, idle=1)
+    assert watch_folder(parts, tmp_path / "out", reading=reading, watching=watching).counts == {"measured": 1}
 
 
 def test_a_folder_of_an_angle_that_never_comes_is_told(tmp_path: Path) -> None:
