@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from polarguide.capture import checks
-from polarguide.capture.calibration import ANGLES, Calibration
 from polarguide.capture.brackets import Bracket
+from polarguide.capture.calibration import ANGLES, Calibration
 from polarguide.capture.develop import COMPARABLE, levels_of_shot, require_one, stated_exposures
 from polarguide.capture.exposures import Angle, Exposure, analyzers, turned
 from polarguide.capture.filter.camera_files import apply_orientation, orientation_calibration

@@ -426,8 +426,8 @@ def light_of_files(
         advance: callback for the number of views that were read.
 
     Returns:
-        The exposures of the shots whose files state an exposure; and a warning, or "". If some files lack a tag that others
-        have, exposures cannot be compared. The result is then empty, and the warning names the missing tags.
+        The exposures of the shots whose files state an exposure; and a warning, or "". If some files lack a tag that
+        others have, exposures cannot be compared. The result is then empty, and the warning names the missing tags.
 
     Raises:
         PolarguideError: a file cannot be read, or the shots of a view have different exposures.
