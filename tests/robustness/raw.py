@@ -196,7 +196,7 @@ CASES += table(
     *(Case(f"that is a pipe, to {verb}", put("calibration.json", "pipe"), f"{command} --calibration calibration.json",
            found="a pipe or device", ci=True) for verb, command in (
         ("prepare", SHOTS), ("priors", "priors shots --out new --no-align --formats npy"),
-        ("measure", "measure shots --out new --no-align"), ("inspect", of("prepared", INSPECT)))),
+        ("measure", "measure shots --out new --no-align"))),
 )  # fmt: skip
 
 
