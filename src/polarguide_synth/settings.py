@@ -13,10 +13,9 @@ from typing import Annotated, Any, Literal
 
 from msgspec import Meta
 
-from polarguide.capture.exposure_files import LARGEST_STOPS
 from polarguide.capture.sensor.pattern import SENSORS, Sensor, any_case, sensor_named
 from polarguide.core.errors import optional_import, require
-from polarguide.core.options import picture_size
+from polarguide.core.options import LARGEST_STOPS, picture_size
 from polarguide.core.records import check_options
 from polarguide.core.text import decimals
 from polarguide_synth.schema import SceneSpec, parse_scene, read_scene_file

@@ -48,7 +48,7 @@ def test_a_signal_that_a_package_makes_another_error_of_ends_the_command(
             raise RuntimeError("error encountered (see above)") from (None if lost else first)
         return 0
 
-    monkeypatch.setattr(app, "_call", stopped)
+    monkeypatch.setattr(app, "call", stopped)
     assert run(["eval", "run"]) == 130
     assert "stopped." in capsys.readouterr().err
 
@@ -98,7 +98,7 @@ def test_a_machine_without_room_is_one_line(
     def fail(*_: object) -> int:
         raise error
 
-    monkeypatch.setattr(app, "_call", fail)
+    monkeypatch.setattr(app, "call", fail)
     assert run(["eval", "run"]) == 2
     assert words in capsys.readouterr().err
 
@@ -119,7 +119,7 @@ def fill(*_):
             last = error
     raise last
 
-app._call = fill
+app.call = fill
 sys.exit(app.run(["eval", "run"]))
 """
 
@@ -137,7 +137,7 @@ def test_faults_of_ours_are_not_hidden(error: Exception, monkeypatch: pytest.Mon
     def fail(*_: object) -> int:
         raise error
 
-    monkeypatch.setattr(app, "_call", fail)
+    monkeypatch.setattr(app, "call", fail)
     with pytest.raises(type(error)):
         run(["eval", "run"])
 
@@ -147,7 +147,7 @@ def test_a_package_that_fails_while_it_is_imported_is_one_line(
 ) -> None:
     (tmp_path / "failing_package.py").write_text("raise ValueError('Unknown setting of ITS_VARIABLE')")
     monkeypatch.syspath_prepend(str(tmp_path))
-    monkeypatch.setattr(app, "_call", lambda *_: importlib.import_module("failing_package"))
+    monkeypatch.setattr(app, "call", lambda *_: importlib.import_module("failing_package"))
     assert run(["eval", "run"]) == 2
     assert "Unknown setting of ITS_VARIABLE. Check the environment's variables" in capsys.readouterr().err
 
@@ -158,7 +158,7 @@ def test_a_signal_that_comes_while_a_package_is_imported_ends_the_command(
     def stopped(*_: object) -> int:
         raise SystemError("returned a result with an exception set") from KeyboardInterrupt()
 
-    monkeypatch.setattr(app, "_call", stopped)
+    monkeypatch.setattr(app, "call", stopped)
     assert run(["eval", "run"]) == 130
     assert "stopped." in capsys.readouterr().err
 

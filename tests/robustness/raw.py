@@ -13,7 +13,7 @@ import cv2
 import hostile_files as made
 import numpy as np
 import spoil
-from base import INSPECT, MAPS, MEASURE, MOSAIC, MOSAICS, READ, SHOTS, into, of, posed
+from base import MAPS, MEASURE, MOSAIC, MOSAICS, READ, SHOTS, into, of, posed
 from case import Case, Change, nothing, table
 from changes import (
     A_NAME, CHECKED, OF_FILES, PLAUSIBLE, copy, deferred, drawn, edit, instead, memory, put, remove, rename,
@@ -196,7 +196,7 @@ CASES += table(
     *(Case(f"that is a pipe, to {verb}", put("calibration.json", "pipe"), f"{command} --calibration calibration.json",
            found="a pipe or device", ci=True) for verb, command in (
         ("prepare", SHOTS), ("priors", "priors shots --out new --no-align --formats npy"),
-        ("measure", "measure shots --out new --no-align"), ("inspect", of("prepared", INSPECT)))),
+        ("measure", "measure shots --out new --no-align"))),
 )  # fmt: skip
 
 

@@ -144,7 +144,7 @@ def test_it_is_viewed(trained: TrainingLoop) -> None:
     assert {layer for layer, found in pictures.items() if found is not None} == set(
         trained.current.shading.layers
     )
-    presentation = Presentation(crop=Crop((-9, -9, -9), (9, 9, 9)))
+    presentation = Presentation(crop=Crop((-9999, -9999, -9999), (9999, 9999, 9999)))
     stronger = Appearance(strength=2.0, turn=30.0, presentation=presentation)
     found, plain = painter.paint(shown, camera, stronger), pictures["final"]
     assert found.mean() > plain.mean() + 1

@@ -21,13 +21,12 @@ from pathlib import Path
 from polarguide.capture.layout import ambiguous, list_files
 from polarguide.core.errors import PolarguideError, require
 from polarguide.core.files import read_rows
+from polarguide.core.options import LARGEST_STOPS
 from polarguide.core.records import shortened
 from polarguide.core.text import canonical, number_or_nan, stem_of
 
 EXPOSURE_TABLE = "exposures.csv"
 """Name of the table of exposures."""
-LARGEST_STOPS = 20.0
-"""Largest absolute exposure in stops. Cameras cover about twenty stops."""
 _COLUMNS = ["file", "shot", "stops"]
 _REMEDY = "Use the columns file, shot and stops; stops may be empty if EXIF data or the pictures state the exposure."
 _LABEL = re.compile(r"(?P<shot>.+?)[-_ .](?:ev ?(?P<stops>[+-]?\d+(?:\.\d+)?)|bracket\d{1,2})", re.IGNORECASE)

@@ -176,6 +176,10 @@ def index_of(specified: float | None, scene: float | None = None) -> float:
     return next((index for index in (specified, scene) if index is not None), INDEX)
 
 
+LARGEST_STOPS = 20.0
+"""Largest absolute exposure in stops. Cameras cover about twenty stops."""
+
+
 @dataclass(frozen=True)
 class SceneOptions:
     """Options for reading a scene folder.

@@ -21,8 +21,9 @@ class Initialization:
             random Gaussians are added inside the shell, because they become haze in front of the cameras.
         shell_radii: inner and outer radius of the shell around the median of the points, in units of the cameras'
             distance. At these distances Gaussians have almost no parallax, like the sky and the horizon.
-        near_radii: the same for captures with too few polarizer angles per view to measure the Stokes vectors. There,
-            distant Gaussians behind a transparent surface could explain the reflection of a distant light.
+        near_radii: the same, used instead if any training view has too few polarizer angles to measure Stokes vectors,
+            also in ordinary photographs. There, distant Gaussians behind a transparent surface could explain the
+            reflection of a distant light.
         opacity: initial opacity of all Gaussians.
     """
 

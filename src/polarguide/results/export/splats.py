@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-from plyfile import PlyData, PlyElement
+from plyfile import PlyData
 
 from polarguide.core.errors import PolarguideError, PolarguideWarning, optional_import
 from polarguide.core.files import write_whole
@@ -28,7 +28,8 @@ SPZ_RANGE = 2047.0
 def write_spz(path: Path, ply: Path, version: int = 3) -> None:
     """Convert a PLY file of Gaussians to SPZ, without the fields that only this program uses.
 
-    Gaussians outside the range of SPZ are left out with a warning.
+    Gaussians outside the range of SPZ are moved toward the origin with a warning. Their size shrinks in proportion, so
+    that they look the same from the origin.
 
     The axes of SPZ are right, up and back. Positions are rounded to 1/4096 of a unit. Colors and scales have 8 bits,
     harmonics 5 or 4 bits by degree.
@@ -44,15 +45,20 @@ def write_spz(path: Path, ply: Path, version: int = 3) -> None:
     converter = optional_import("gaussforge", "--format spz").GaussForge()
     content = PlyData.read(ply)
     vertices = content["vertex"].data
-    inside = np.all([np.abs(vertices[axis]) <= SPZ_RANGE for axis in "xyz"], axis=0)
-    if not inside.all():
+    positions = np.stack([vertices[axis] for axis in "xyz"])
+    shrink = np.minimum(1, SPZ_RANGE / np.abs(positions).max(axis=0).clip(min=1e-9))
+    moved = np.count_nonzero(shrink < 1)
+    if moved:
         warnings.warn(
-            f"{path}: SPZ has no positions beyond {SPZ_RANGE:g} units. {np.count_nonzero(~inside):,} of "
-            f"{len(inside):,} Gaussians are left out. Export to ply to keep them.",
+            f"{path}: SPZ has no positions beyond {SPZ_RANGE:g} units. {moved:,} of {len(vertices):,} Gaussians are "
+            "moved toward the origin and made smaller, so that they look the same from there.",
             PolarguideWarning,
             stacklevel=2,
         )
-        content = PlyData([PlyElement.describe(vertices[inside], "vertex")])
+        for axis in "xyz":
+            vertices[axis] *= shrink
+        for name in ("scale_0", "scale_1", "scale_2"):
+            vertices[name] += np.log(shrink)
     data = io.BytesIO()
     content.write(data)
     converted = converter.convert(data.getvalue(), "ply", "spz", spz_version=version)

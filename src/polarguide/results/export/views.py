@@ -183,6 +183,7 @@ def export_normals(
     Raises:
         PolarguideError: the folder contains other files, or the run lacks the requested pictures.
     """
+    _require_pictures(run, options)
     reader = NORMAL_READERS[options.layout]
     places = [name for name in (IMAGES, reader.folder, reader.masks) if name]
     require_own(folder, MODEL, *places)
@@ -210,6 +211,20 @@ def export_normals(
             _write_picture(folder / IMAGES / file, training_picture(run, view, result, options), presented)
             advance(number)
     return [*paths, *(folder / name for name in (*places, reader.points) if name)]
+
+
+def _require_pictures(run: OpenedRun, options: NormalOptions) -> None:
+    """Check, before a file is written, that the requested pictures exist.
+
+    Raises:
+        PolarguideError: the recipe has no diffuse layer, or the pictures of a view do not determine Stokes vectors.
+    """
+    views = run.scene.train_views
+    if options.picture == "minimum":
+        view = next((view for view in views if not view.is_determined), views[0])
+        view.stokes()
+    elif options.picture == "diffuse":
+        run.chosen_layers(run.result(views[0].camera), ["diffuse"])
 
 
 def decided_pixels(result: RenderResult, camera: Camera, subject: Subject) -> Tensor:

@@ -20,11 +20,12 @@ Unpolarized light has no U. Polarized light changes P about as much as U. A meta
 A dielectric preserves at most ``sqrt(Rs Rp)`` times the light of the scene. Under each hypothesis, the explained part
 of U reduces the error in P, and the rest of U is added as an error.
 
-The errors E are mean squares of d = 2 n observations relative to the light: P and U in n views. Their variance differs
-between surfaces, because it includes the errors of the rendered normals. Its prior is a scaled inverse chi-square
-distribution with scale ``s^2`` and weight ``d0``, both estimated from all surfaces of the scene (``variance_prior``).
-With the variance integrated out, the log likelihood ratio is ``(d0 + d)/2 log((d0 s^2 + d E_dielectric) / (d0 s^2 + d
-E_metal))`` (Smyth 2004, "Linear models and empirical Bayes methods", Statistical Applications in Genetics 3).
+The errors E are mean squares relative to the light. They count as d = 2 n observations, P and U in n independent views:
+two views less than the surface has, because the unknowns are fitted. Their variance differs between surfaces, because
+it includes the errors of the rendered normals. Its prior is a scaled inverse chi-square distribution with scale
+``s^2`` and weight ``d0``, both estimated from all surfaces of the scene (``variance_prior``). With the variance
+integrated out, the log likelihood ratio is ``(d0 + d)/2 log((d0 s^2 + d E_dielectric) / (d0 s^2 + d E_metal))`` (Smyth
+2004, "Linear models and empirical Bayes methods", Statistical Applications in Genetics 3).
 """
 
 from __future__ import annotations
