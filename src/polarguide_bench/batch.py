@@ -98,7 +98,7 @@ class CaptureRow:
 
 def write_page(out: Path, rows: Sequence[CaptureRow]) -> None:
     """Write ``index.html`` and ``results.csv`` atomically. The page links to files in the folders of the captures."""
-    scores = {row.name: row.scores() for row in rows}
+    scores = {(row.name, row.recipe): row.scores() for row in rows}
     columns = [
         column
         for column in COLUMNS
@@ -115,7 +115,8 @@ def write_page(out: Path, rows: Sequence[CaptureRow]) -> None:
         columns=columns,
         several=len(rows) > len({row.name for row in rows}),
         rows=[
-            (row, [formatted(scores[row.name].get(column.key), column) for column in columns]) for row in rows
+            (row, [formatted(scores[row.name, row.recipe].get(column.key), column) for column in columns])
+            for row in rows
         ],
     )
     write_text(out / "index.html", html)
@@ -127,7 +128,7 @@ def write_page(out: Path, rows: Sequence[CaptureRow]) -> None:
                 "path": row.source,
                 "state": row.state,
                 "verdict": row.record.verdict,
-                **{column.key: scores[row.name].get(column.key) for column in columns},
+                **{column.key: scores[row.name, row.recipe].get(column.key) for column in columns},
                 "error": row.error,
             }
             for row in rows

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from datetime import datetime, timezone
 from pathlib import Path
@@ -114,6 +114,7 @@ def compare(
         PolarguideError: the input is invalid, or another comparison is writing to ``out``.
     """
     reporter = notebook_reporter() if reporter is None else reporter
+    _require_lists(scenes=scenes, recipes=recipes, metrics=metrics)
     options = _read_alike(scenes, options)
     for metric in metrics:
         register_metric(metric)
@@ -180,6 +181,7 @@ def ablate(
     Raises:
         PolarguideError: the recipe has no ablations, an ablation is unknown, or the comparison fails, see ``compare``.
     """
+    _require_lists(only=only, reference=reference)
     return compare(
         scenes,
         [*reference, *ablated(base, only)],
@@ -191,12 +193,34 @@ def ablate(
     )
 
 
+def _require_lists(**arguments: object) -> None:
+    """Check that each argument is a collection, not a single object or text.
+
+    Raises:
+        PolarguideError: an argument is not a collection. The error has its name.
+    """
+    for name, value in arguments.items():
+        require(
+            isinstance(value, Collection) and not isinstance(value, str | bytes),
+            name,
+            expected=f"a list, {name}=[...]",
+            found=f"a single {type(value).__name__}",
+            remedy="Put it into a list, even if the list has only one element.",
+        )
+
+
 def _read_alike(scenes: Sequence[PathLike | Scene], options: CompareOptions) -> CompareOptions:
     """Return the options with the downscale and the transfer with which all scene objects were read.
+
+    Specified options or else the first object determine both values.
 
     Raises:
         PolarguideError: an object is not a scene, is not in a folder, or was read in another way.
     """
+    first = next((scene for scene in scenes if isinstance(scene, Scene)), None)
+    for name, default in (("downscale", SceneOptions.downscale), ("transfer", SceneOptions.transfer)):
+        if first is not None and getattr(options, name) == default:
+            options = replace(options, **{name: getattr(first, name)})
     for scene in scenes:
         require(
             isinstance(scene, str | os.PathLike | Scene),
@@ -214,17 +238,16 @@ def _read_alike(scenes: Sequence[PathLike | Scene], options: CompareOptions) -> 
             found=f"the scene {scene.name} in memory",
             remedy="Write its pictures to a folder, and use polarguide.prepare.",
         )
-        for name, default in (("downscale", SceneOptions.downscale), ("transfer", SceneOptions.transfer)):
+        for name in ("downscale", "transfer"):
             stated = getattr(options, name)
             value = getattr(scene, name)
             require(
-                value == stated or stated == default,
+                value == stated,
                 "scenes",
                 expected=f"scenes that were read with {name} {stated}",
                 found=f"{scene.name} with {name} {value}",
                 remedy=f"Read all scenes with the same {name}.",
             )
-            options = replace(options, **{name: value})
     return options
 
 

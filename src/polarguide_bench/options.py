@@ -127,7 +127,7 @@ class BatchOptions(ClusterOptions):
     """Options for processing captures.
 
     Attributes:
-        formats: Export formats: ply, spz, mesh, environment or cameras.
+        formats: Export formats, as for --format of polarguide export.
         device: Device of trainings and renderings.
     """
 

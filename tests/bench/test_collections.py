@@ -21,7 +21,7 @@ from polarguide.preparation.settings import PrepareSettings
 from polarguide.runs.folder import RunConfiguration
 from polarguide.training.settings import TrainSettings
 from polarguide_bench import job_queue
-from polarguide_bench.batch import CaptureRow, _tasks, run_batch
+from polarguide_bench.batch import CaptureRow, _tasks, run_batch, write_page
 from polarguide_bench.children import FORMAT, STEPS, Capture, CaptureRecord, Message, prepare_settings
 from polarguide_bench.compare import locked
 from polarguide_bench.options import BatchOptions
@@ -113,6 +113,23 @@ def test_broken_captures_are_rows_and_the_others_go_on_also_after_a_stop(
     table = pd.read_csv(tmp_path / "results.csv")
     assert table["recipe"].tolist() == ["3dgs", "ref-gs"]
     assert table["psnr"].notna().all()
+
+
+def test_each_recipe_has_its_own_scores(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    request = _tasks(Capture("a", tmp_path, PrepareSettings()), tmp_path, OPTIONS)[0].request
+    record = CaptureRecord(FORMAT, request, done=STEPS, verdict="ok")
+    rows = [
+        CaptureRow("a", recipe, "", tmp_path / "captures" / recipe, "done", "", record)
+        for recipe in ("3dgs", "ref-gs")
+    ]
+    monkeypatch.setattr(
+        CaptureRow, "scores", lambda row: {"psnr": {"3dgs": 21.0, "ref-gs": 32.0}[row.recipe]}
+    )
+    monkeypatch.setattr(CaptureRow, "remarks", lambda row: ())
+    write_page(tmp_path, rows)
+    assert pd.read_csv(tmp_path / "results.csv")["psnr"].tolist() == [21.0, 32.0]
+    html = (tmp_path / "index.html").read_text()
+    assert html.index("21.00") < html.index("32.00")
 
 
 def test_two_in_one_folder_exclude_each_other(collection: list[Capture], tmp_path: Path) -> None:

@@ -95,6 +95,30 @@ def test_a_recipe_with_a_new_name_is_known_by_its_name() -> None:
     Fault("recipe mine (ssim_weight)").raised_by(chosen_recipes, [broken])
 
 
+@pytest.mark.parametrize("name", ["gnerp", "gnerp:mine"])
+def test_a_reserved_name_is_refused_and_not_registered(name: str) -> None:
+    Fault(f"recipe {name}", "does not begin with gnerp", "baseline").raised_by(
+        chosen_recipes, [replace(BASE, name=name)]
+    )
+    assert name not in registry.REGISTERED
+    assert "3dgs" in polarguide.recipes()
+
+
+@pytest.mark.parametrize("argument", ["scenes", "recipes", "metrics"])
+@pytest.mark.parametrize("value", ["text", BASE, BRIGHTNESS, make_scene(), Path("scene"), None])
+def test_a_single_object_instead_of_a_list_is_refused(tmp_path: Path, argument: str, value: Any) -> None:
+    out = tmp_path / "out"
+    arguments = {"scenes": [tmp_path], "recipes": ["3dgs"], "metrics": []} | {argument: value}
+    Fault(argument, f"{argument}=[...]", f"a single {type(value).__name__}").raised_by(
+        polarguide.compare, out=out, **arguments
+    )
+    for name in ("only", "reference"):
+        Fault(name, "a list", "a single str").raised_by(
+            polarguide.ablate, [tmp_path], "polarguide", out, **{name: "without-normals"}
+        )
+    assert not out.exists()
+
+
 @pytest.mark.parametrize(
     ("metric", "fault"),
     [
@@ -148,6 +172,12 @@ def test_a_scene_that_processes_cannot_read_is_refused(demo_scene: Path, tmp_pat
     Fault("scenes", "downscale 4", "downscale 8").raised_by(
         polarguide.compare, [scene], ["3dgs"], out, options=other
     )
+    full = polarguide.load_scene(demo_scene, downscale=1)
+    for scenes in ([full, scene], [scene, full], [demo_scene, full, scene]):
+        first, second = [item.downscale for item in scenes if isinstance(item, polarguide.Scene)]
+        Fault("scenes", f"downscale {first}", f"downscale {second}").raised_by(
+            polarguide.compare, scenes, ["3dgs"], out
+        )
     fewer = replace(scene, views=scene.views[1:])
     Fault("scenes", "as its folder contains it").raised_by(polarguide.compare, [fewer], ["3dgs"], out)
     assert not out.exists()

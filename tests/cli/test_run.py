@@ -13,6 +13,7 @@ import pytest
 from camera_files import behind, busy_light, write_mosaics, write_picture
 
 from polarguide.cli import app
+from polarguide.cli.run import _is_current
 
 Refused = Callable[..., str]
 VIEWS = 6
@@ -103,7 +104,8 @@ def test_a_scene_is_trained_and_the_same_command_resumes(
         if verb != "inspect":
             return own_call(verb, words)
         (out / "inspection").mkdir(parents=True, exist_ok=True)
-        (out / "inspection" / "inspection.json").write_text(json.dumps({"verdict": "wrong"}))
+        record = {"verdict": "wrong", "scene": {"path": str(Path(words[1]).resolve())}}
+        (out / "inspection" / "inspection.json").write_text(json.dumps(record))
         return 0
 
     monkeypatch.setattr(app, "call", call)
@@ -123,6 +125,21 @@ def test_a_scene_is_trained_and_the_same_command_resumes(
     os.utime(scene / "split.json")
     own_call("run", ["run", *line])
     assert called == ["inspect", "train --resume", "eval"]
+
+
+def test_an_inspection_of_another_scene_is_not_reused(demo_scene: Path, tmp_path: Path) -> None:
+    """Both scenes are older than the record."""
+    first = Path(shutil.copytree(demo_scene, tmp_path / "first"))
+    second = Path(shutil.copytree(demo_scene, tmp_path / "second"))
+    record = tmp_path / "inspection" / "inspection.json"
+    assert not _is_current(record, first)
+    own_call("inspect", ["inspect", str(first), "--out", str(record.parent), "--normals", "points"])
+    assert _is_current(record, first)
+    assert not _is_current(record, second)
+    content = json.loads(record.read_text())
+    del content["scene"]["path"]
+    record.write_text(json.dumps(content))
+    assert not _is_current(record, first)
 
 
 def test_ctrl_c_names_the_command_that_continues(

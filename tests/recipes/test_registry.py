@@ -19,6 +19,7 @@ ONE = replace(RECIPES["3dgs"], name="{name}", means_decay=0.5)
 SEVERAL = [ONE, replace(ONE, name="{name}:slow", means_decay=0.1)]
 NUMBER = 3
 TAKEN = replace(ONE, name="3dgs")
+RESERVED = replace(ONE, name="gnerp:mine")
 def made(): return SEVERAL
 def broken(): raise RuntimeError("no GPU here")
 def ends(): raise SystemExit(0)
@@ -67,6 +68,7 @@ def test_a_built_in_name_loads_no_plug_in(monkeypatch: pytest.MonkeyPatch, tmp_p
         ("broken", "RuntimeError: no GPU here"),
         ("none", "AttributeError"),
         ("TAKEN", "3dgs, which is built in"),
+        ("RESERVED", "gnerp:mine, which is built in"),
         ("ends", "SystemExit: 0"),
         ("NAMED", "7"),
         ("LINES", "two\\nlines"),

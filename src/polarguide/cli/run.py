@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -15,7 +16,7 @@ from polarguide.cli.console import say, warn
 from polarguide.core.errors import require
 from polarguide.core.options import DeviceName, SceneOptions
 from polarguide.core.records import option_name, read_record
-from polarguide.core.text import canonical, command
+from polarguide.core.text import canonical, command, printable
 from polarguide.preparation.settings import PrepareSettings
 from polarguide.training.settings import TrainSettings
 
@@ -23,6 +24,19 @@ CONFIGURATION = "run.json"
 """File that a training writes at its start."""
 INSPECTION = "inspection.json"
 """File that contains the verdict of an inspection."""
+
+
+@dataclass(frozen=True)
+class InspectionSummary:
+    """Fields of an inspection record that this verb reads.
+
+    Attributes:
+        verdict: verdict of the inspection.
+        scene: description of the inspected scene.
+    """
+
+    verdict: str
+    scene: dict[str, Any]
 
 
 def run_folder(
@@ -140,7 +154,7 @@ def _description(source: Path, settings: PrepareSettings) -> str:
 
 
 def _call(words: Sequence[str], scene: Path, folder: Path) -> None:
-    """Call a verb. An inspection that is newer than the scene is not repeated, and a training is resumed."""
+    """Call a verb. An inspection of the unchanged scene is not repeated, and a training is resumed."""
     verb = words[0]
     resume = verb == "train" and (folder / "run" / CONFIGURATION).exists()
     say("")
@@ -160,13 +174,15 @@ def _call(words: Sequence[str], scene: Path, folder: Path) -> None:
         )
 
 
-def _verdict(folder: Path) -> Any:
+def _verdict(folder: Path) -> str:
     """Return the verdict of the inspection."""
-    return read_record(folder / "inspection" / INSPECTION, dict[str, Any])["verdict"]
+    return read_record(folder / "inspection" / INSPECTION, InspectionSummary).verdict
 
 
 def _is_current(record: Path, scene: Path) -> bool:
-    """Return True if a record is newer than all files of a scene."""
-    return record.is_file() and record.stat().st_mtime_ns > max(
-        path.stat().st_mtime_ns for path in scene.rglob("*")
-    )
+    """Return True if the record of an inspection is of this scene and newer than all its files."""
+    if not record.is_file():
+        return False
+    inspected = read_record(record, InspectionSummary).scene.get("path")
+    newest = max(path.stat().st_mtime_ns for path in scene.rglob("*"))
+    return inspected == printable(str(scene.resolve())) and record.stat().st_mtime_ns > newest

@@ -1,80 +1,146 @@
-"""Digest of the source of functions and classes that a user defines, such as a loss term or a metric."""
+"""Digest of functions, classes and objects that a user defines, such as a loss term or a metric."""
 
 from __future__ import annotations
 
 import hashlib
-import inspect
 import sys
 import sysconfig
-from collections.abc import Iterator
-from types import FunctionType, ModuleType
+from collections.abc import Iterable, Iterator
+from types import CellType, CodeType, FunctionType, MappingProxyType, ModuleType
 from typing import Any
 
-_PLAIN = (bool, int, float, str, bytes, type(None))
+import torch
+from torch import Tensor
+
+_PLAIN = (bool, int, float, complex, str, bytes, type(None), type(...))
 _INSTALLED = tuple(sysconfig.get_paths()[name] for name in ("stdlib", "platstdlib", "purelib", "platlib"))
+_WRAPPED = ("__wrapped__", "fget", "fset", "fdel")
+"""Attributes in which decorators and properties keep the functions of the user."""
+_CODE = (
+    "co_code",
+    "co_consts",
+    "co_names",
+    "co_varnames",
+    "co_freevars",
+    "co_cellvars",
+    "co_flags",
+    "co_argcount",
+    "co_posonlyargcount",
+    "co_kwonlyargcount",
+    "co_exceptiontable",
+)
+"""Attributes of compiled code that determine its results. Line numbers and file names are not among them."""
 
 
 def definition_digest(*definitions: Any) -> str:
-    """Hash functions, classes and objects together with the user's definitions that they use.
+    """Hash functions, classes and objects together with the user's definitions and values that they use.
 
-    Functions are hashed by their source, and by their byte code if there is no source. Definitions of this project and
-    of installed packages are not hashed.
+    A function counts with its compiled code, default values, closure, and the globals that the code names. A class
+    counts with its bases and members, and an object with its class and the state that pickle would write. Definitions
+    of this project and of installed packages count with their names.
 
     Args:
-        definitions: functions, classes, or objects whose classes are hashed.
+        definitions: functions, classes, or objects.
 
     Returns:
         Sixteen hexadecimal digits.
     """
-    digest = hashlib.sha256()
-    waiting = [*definitions]
-    known: dict[int, Any] = {}
-    while waiting:
-        item = waiting.pop()
-        if id(item) not in known:
-            known[id(item)] = item
-            digest.update(f"{_text(item)}\n".encode())
-            waiting += _used(item)
-    return digest.hexdigest()[:16]
+    return _digest(definitions, {})[:16]
 
 
-def _text(item: Any) -> str:
-    """Return the source of a function, the name of a class, or the representation of a plain value."""
+def _digest(item: Any, known: dict[int, tuple[Any, str]]) -> str:
+    """Return the digest of an item and its parts.
+
+    Args:
+        item: any object.
+        known: items by identity, with their digests. Their references keep the identities unique.
+    """
+    if id(item) not in known:
+        known[id(item)] = (item, "cycle")
+        text, parts = _content(item)
+        digests = [_digest(part, known) for part in parts]
+        if isinstance(item, set | frozenset):
+            digests.sort()
+        lines = "\n".join((type(item).__qualname__, text, *digests))
+        known[id(item)] = (item, hashlib.sha256(lines.encode(errors="surrogatepass")).hexdigest())
+    return known[id(item)][1]
+
+
+def _content(item: Any) -> tuple[str, Iterable[Any]]:
+    """Return the text of an item itself, and its parts."""
+    if type(item) in _PLAIN:
+        return repr(item), ()
+    if isinstance(item, Tensor):
+        values = item.detach().cpu().to_dense().contiguous().reshape(-1).view(torch.uint8)
+        return f"{item.dtype} {tuple(item.shape)}", (values.numpy().tobytes(),)
+    if isinstance(item, CodeType):
+        return "", [getattr(item, name, None) for name in _CODE]
+    if isinstance(item, FunctionType | type | ModuleType) and not _is_own(item):
+        return f"{getattr(item, '__module__', '')}.{getattr(item, '__qualname__', item.__name__)}", ()
     if isinstance(item, FunctionType):
-        try:
-            return inspect.getsource(item)
-        except (OSError, TypeError):
-            code = item.__code__
-            return f"{code.co_code.hex()} {[c for c in code.co_consts if isinstance(c, _PLAIN)]}"
-    return repr(item) if isinstance(item, _PLAIN) else getattr(item, "__qualname__", "")
+        return "", (item.__code__, item.__defaults__, item.__kwdefaults__, vars(item), *_named_values(item))
+    if isinstance(item, type):
+        return item.__qualname__, (*item.__bases__, *_members(item))
+    if isinstance(item, ModuleType):
+        return item.__name__, ()
+    if type(item) in (dict, MappingProxyType):
+        return "", [part for pair in item.items() for part in pair]
+    if type(item) in (tuple, list) or isinstance(item, set | frozenset):
+        return "", (type(item), *item)
+    return _state(item)
 
 
-def _used(item: Any) -> Iterator[Any]:
-    """Yield the parts of a definition: methods, base classes, globals, closures, fields and items."""
-    if isinstance(item, FunctionType):
-        names = item.__code__.co_names
-        values = [item.__globals__.get(name) for name in names]
-        modules = [vars(value) for value in values if isinstance(value, ModuleType) and _is_own(value)]
-        values += [module.get(name) for module in modules for name in names]
-        values += [cell.cell_contents for cell in item.__closure__ or ()]
-        yield from (value for value in values if isinstance(value, _PLAIN) or _is_own(value))
-    elif isinstance(item, type):
-        members = vars(item).values() if _is_own(item) else ()
-        for value in (*members, *item.__bases__):
-            function = getattr(value, "fget", None) or getattr(value, "__func__", value)
-            if isinstance(function, FunctionType | type) and _is_own(function):
-                yield function
-    elif isinstance(item, tuple | list):
-        yield from item
-    elif not isinstance(item, _PLAIN):
-        yield type(item)
-        yield from vars(item).values() if hasattr(item, "__dict__") else ()
+def _named_values(function: FunctionType) -> Iterator[Any]:
+    """Yield the values of the names in the code of a function: from its closure, globals, and the user's modules."""
+    code = function.__code__
+    cells = zip(code.co_freevars, function.__closure__ or (), strict=True)
+    closure = {name: cell.cell_contents for name, cell in cells if cell != CellType()}
+    names = [*code.co_freevars, *_names(code)]
+    scopes = [closure, function.__globals__]
+    for scope in scopes:  # the loop appends the user's modules
+        for name in names:
+            value = scope.get(name)
+            if not isinstance(value, ModuleType) or not _is_own(value):
+                yield value
+            elif not any(vars(value) is other for other in scopes):
+                scopes.append(vars(value))
+
+
+def _names(code: CodeType) -> Iterator[str]:
+    """Yield the names of globals and attributes in compiled code, including nested functions and comprehensions."""
+    yield from code.co_names
+    for constant in code.co_consts:
+        if isinstance(constant, CodeType):
+            yield from _names(constant)
+
+
+def _members(definition: type) -> Iterator[Any]:
+    """Yield names and values of the members of a class, without the data that Python adds."""
+    for name, value in vars(definition).items():
+        if not name.startswith("__") or callable(value) or hasattr(value, "__func__"):
+            yield name
+            yield value
+
+
+def _state(item: Any) -> tuple[str, Iterable[Any]]:
+    """Return the state of an object as pickle reads it, or else its attributes and wrapped functions."""
+    try:
+        state = item.__reduce_ex__(2)
+    except Exception:  # the class may be of the user, and may raise any error
+        state = ""
+    if isinstance(state, str):
+        wrapped = (getattr(item, name, None) for name in _WRAPPED)
+        return state, (type(item), getattr(item, "__dict__", None), *wrapped)
+    return "", [tuple(part) if isinstance(part, Iterator) else part for part in state]
 
 
 def _is_own(item: Any) -> bool:
     """Return True if a definition or module is the user's, not of this project or of an installed package."""
     name = item.__name__ if isinstance(item, ModuleType) else getattr(item, "__module__", None) or ""
-    file = getattr(sys.modules.get(name), "__file__", None)
+    module = sys.modules.get(name)
+    file = getattr(module, "__file__", None) or next(iter(getattr(module, "__path__", ())), None)
+    if file is None and isinstance(item, FunctionType):
+        file = item.__code__.co_filename
     is_installed = (
         file is None or file.startswith(_INSTALLED) or name.partition(".")[0].startswith("polarguide")
     )

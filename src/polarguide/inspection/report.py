@@ -14,6 +14,7 @@ from polarguide import __version__, optics
 from polarguide.core.files import make_folder, write_text, write_whole
 from polarguide.core.progress import SILENT, Reporter
 from polarguide.core.records import to_json
+from polarguide.core.text import printable
 from polarguide.inspection.capture import InspectedView, ViewMeasurements, quantile
 from polarguide.inspection.inspect import Inspection
 from polarguide.inspection.settings import json_value
@@ -195,6 +196,7 @@ def inspection_record(inspection: Inspection) -> dict[str, Any]:
                 "program": f"polarguide {__version__}",
                 "scene": {
                     "name": capture.name,
+                    "path": printable(str(capture.root.resolve())),
                     "views": len(capture.views),
                     "posed_views": len(capture.posed),
                     "size": list(capture.size),

@@ -138,7 +138,7 @@ def recipe_named(name: str) -> Recipe:
         return _BUILT_IN[name]
     base = name.partition(":")[0]
     require(
-        base != _ONLY_COMPARED,
+        not _is_only_compared(name),
         "recipe",
         expected="a recipe of Gaussians",
         found=f"{name}, a signed-distance field, which is a baseline of comparisons",
@@ -202,6 +202,13 @@ def register_recipe(recipe: Recipe) -> None:
     """
     where = f"recipe {recipe.name}"
     check_recipe(recipe, where)
+    require(
+        not _is_only_compared(recipe.name),
+        where,
+        expected=f"a name that does not begin with {_ONLY_COMPARED}",
+        found=f"a name of the baseline {_ONLY_COMPARED}",
+        remedy="Rename it: dataclasses.replace(recipe, name=...).",
+    )
     taken = {**_BUILT_IN, **_ablations(), **_plugins()[0]}
     require(
         recipe.name not in taken,
@@ -211,6 +218,11 @@ def register_recipe(recipe: Recipe) -> None:
         remedy="Rename it: dataclasses.replace(recipe, name=...).",
     )
     REGISTERED[recipe.name] = recipe
+
+
+def _is_only_compared(name: str) -> bool:
+    """Return True for the name of the baseline that only ``polarguide_bench`` can train, and of its variations."""
+    return name.partition(":")[0] == _ONLY_COMPARED
 
 
 def variations_offered(name: str) -> tuple[Recipe, ...]:
@@ -263,7 +275,7 @@ def _recipes_of(entry: EntryPoint) -> tuple[Recipe, ...]:
         if not isinstance(recipe, Recipe):
             raise PolarguideError(where, expected="recipes", found=repr(recipe), remedy=remedy)
         check_recipe(recipe, where)
-        if recipe.name in _BUILT_IN:
+        if recipe.name in _BUILT_IN or _is_only_compared(recipe.name):
             actual = f"{recipe.name}, which is built in"
             raise PolarguideError(where, expected="a unique name", found=actual, remedy=remedy)
     return recipes
