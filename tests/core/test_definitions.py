@@ -62,6 +62,7 @@ from dataclasses import dataclass, field
 LIMITS = (1.0, {"low": [2.0]})
 NAMES = {"a", "b", "c"}
 MASK = torch.tensor([1.0, 3.0])
+TENSORS = [torch.ones(2, dtype=torch.complex64).conj(), torch.eye(2).to_sparse(), torch.tensor(17.0), torch.zeros(0, 3)]
 ARRAY = np.array([4, 5])
 LOCK = threading.Lock()
 class Kind(enum.Enum):
@@ -97,7 +98,7 @@ def measure(target, layers):
         return never
     terms = [inner(x) + LIMITS[0] for x in target if x in {"p", "q", "r"}]
     terms += (own_package.helper.offset(1) for x in (lambda: MASK + ARRAY)())
-    terms += [Part.SCALE, Weights, outer, table, LOCK, NAMES, Kind.FIRST, measure, later]
+    terms += [Part.SCALE, Weights, outer, table, LOCK, NAMES, TENSORS, Kind.FIRST, measure, later]
     return terms
     never = 0
 made = {}
@@ -123,7 +124,7 @@ def test_a_digest_follows_values_and_nested_code(tmp_path: Path, monkeypatch: py
     monkeypatch.syspath_prepend(tmp_path)
     before = digest_of(VALUES)
     assert digests(tmp_path, f"# Another line number\n{VALUES}{PRINT}") == [before]
-    changes = {f"{number}.0": "0.5" for number in (1, 2, 3, *range(6, 17))}
+    changes = {f"{number}.0": "0.5" for number in (1, 2, 3, *range(6, 18))}
     changes |= {"[4, 5]": "[4, 6]", '"c"': '"d"', '"first"': '"second"', '"r"': '"s"', "abs(x)": "len(x)"}
     changed = {old: digest_of(VALUES.replace(old, new, 1)) for old, new in changes.items()}
     assert [old for old, digest in changed.items() if digest == before] == []

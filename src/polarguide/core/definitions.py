@@ -71,7 +71,8 @@ def _content(item: Any) -> tuple[str, Iterable[Any]]:
     if type(item) in _PLAIN:
         return repr(item), ()
     if isinstance(item, Tensor):
-        values = item.detach().cpu().to_dense().contiguous().reshape(-1).view(torch.uint8)
+        dense = item.detach().cpu().to_dense().resolve_conj().resolve_neg()
+        values = dense.reshape(-1).contiguous().view(torch.uint8)
         return f"{item.dtype} {tuple(item.shape)}", (values.numpy().tobytes(),)
     if isinstance(item, CodeType):
         return "", [getattr(item, name, None) for name in _CODE]
