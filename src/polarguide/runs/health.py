@@ -685,7 +685,9 @@ def report_metals(
     ]
     labels = ["photograph", "metal", "undecided"]
     write_png(out / METALS_PICTURE, contact_sheet(rows, [view.name for view in views], labels))
-    advice = ". Label metal in materials/ of the scene (docs/how-to/train.md), and train again" if unknown else ""
+    advice = (
+        ". Label metal in materials/ of the scene (docs/how-to/train.md), and train again" if unknown else ""
+    )
     reporter.say(
         f"metals: {metal:.1f} % of the pixels; not decided by polarization: {unknown:.1f} %, see "
         f"{out / METALS_PICTURE}{advice}"
