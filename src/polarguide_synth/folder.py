@@ -180,7 +180,7 @@ def _require(condition: bool, path: Path, expected: str) -> None:
 CONVENTION = {
     "intensity": "I_a = (S0 + S1 cos 2a + S2 sin 2a) / 2 is PNG value / 65535, linear",
     "aolp": "atan2(S2, S1) / 2 from the image's horizontal, counter-clockwise as displayed, in the lens frame of "
-    "each ray (docs/explanation/conventions.md)",
+    "each ray (docs/reference/conventions.md)",
     "camera": "OpenCV axes, world to camera x_cam = R x_world + t, pixel centers at 0.5",
     "truth": "; ".join(
         (
