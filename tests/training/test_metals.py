@@ -18,9 +18,9 @@ from polarguide import optics
 from polarguide.capture import Scene, View
 from polarguide.core.progress import Reporter
 from polarguide.gaussians.gaussians import any_nonzero
-from polarguide.methods import RECIPES
 from polarguide.optics.fresnel import reflectances_from_cosine
 from polarguide.raster.cpu import rasterize_cpu
+from polarguide.methods import RECIPES
 from polarguide.runs.folder import load_checkpoint, save_checkpoint
 from polarguide.runs.health import METALS_PICTURE, report_metals
 from polarguide.runs.model import GaussianModel
@@ -39,12 +39,10 @@ from polarguide.training.metals.search import (
     decide,
     errors,
     evidence,
-    likelihood_ratio,
     looks,
     minimum_cut,
     surfaces,
     unary,
-    variance_prior,
     warn_of_unused_materials,
 )
 from polarguide.training.recipe import MetalRules, MetalViews
@@ -128,39 +126,6 @@ def test_a_neighbor_of_a_metal_is_none(material: str, other: str, most: float) -
     x, _, z = ball_of_two["means"].unbind(1)
     assert float(metal[(z > 0.1) & (x > 0.1)].float().mean()) > 0.8
     assert float(metal[(z > 0.1) & (x < -0.1)].float().mean()) < most
-
-
-@pytest.mark.parametrize(("scale", "weight"), [(4e-4, 2.0), (1e-3, 6.0), (2e-4, 40.0)])
-def test_the_prior_of_error_variances_is_estimated_from_samples(scale: float, weight: float) -> None:
-    random = np.random.default_rng(3)
-    observations = random.integers(2, 30, 20_000)
-    variances = scale * weight / random.chisquare(weight, 20_000)
-    samples = variances * random.chisquare(observations) / observations
-    prior = variance_prior(torch.from_numpy(samples), torch.from_numpy(observations))
-    assert prior.scale == pytest.approx(scale, rel=0.05)
-    assert prior.weight == pytest.approx(weight, rel=0.15)
-
-
-def test_equal_variances_give_a_strong_prior() -> None:
-    random = np.random.default_rng(4)
-    samples = 1e-3 * random.chisquare(10, 5000) / 10
-    prior = variance_prior(torch.from_numpy(samples), torch.full((5000,), 10.0))
-    assert prior.weight > 200
-    assert prior.scale == pytest.approx(1e-3, rel=0.02)
-
-
-def test_large_errors_of_other_surfaces_do_not_hide_a_metal() -> None:
-    """Surfaces with wrong normals, with correct normals, and a metal with five views."""
-    dielectric = torch.tensor([1.4e-3] * 500 + [2e-4] * 300 + [1.5e-3])
-    metal = torch.tensor([2e-3] * 500 + [8e-4] * 300 + [2e-4])
-    ratio = likelihood_ratio(dielectric, metal, torch.full((801,), 5.0))
-    assert float(ratio[-1]) > 2 * RULES.prior
-    assert float(ratio[:-1].max()) < 0
-
-
-def test_surfaces_in_too_few_views_give_no_evidence() -> None:
-    views = torch.tensor([0.0, 0.3, 0.0])
-    assert not bool(likelihood_ratio(torch.ones(3), 0.1 * torch.ones(3), views).any())
 
 
 def random_graph(count: int, seed: int) -> tuple[np.ndarray, Graph]:
