@@ -18,9 +18,9 @@ from polarguide import optics
 from polarguide.capture import Scene, View
 from polarguide.core.progress import Reporter
 from polarguide.gaussians.gaussians import any_nonzero
+from polarguide.methods import RECIPES
 from polarguide.optics.fresnel import reflectances_from_cosine
 from polarguide.raster.cpu import rasterize_cpu
-from polarguide.methods import RECIPES
 from polarguide.runs.folder import load_checkpoint, save_checkpoint
 from polarguide.runs.health import METALS_PICTURE, report_metals
 from polarguide.runs.model import GaussianModel
