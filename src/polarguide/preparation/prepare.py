@@ -9,11 +9,10 @@ from __future__ import annotations
 import contextlib
 import itertools
 import os
-import re
 import shlex
 import shutil
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -24,7 +23,7 @@ from numpy.typing import NDArray
 
 from polarguide import __version__
 from polarguide.capture.colmap.model import read_model
-from polarguide.capture.colmap.poses import Geometry, Poses, Undistortion
+from polarguide.capture.colmap.poses import Geometry, Poses
 from polarguide.capture.colmap.sfm import LEAST_VIEWS, NotConnectedError, add_points, reconstruct, tone_mapped
 from polarguide.capture.filter.camera_files import TURNS
 from polarguide.capture.filter.consecutive import chosen_matching
@@ -34,7 +33,6 @@ from polarguide.capture.view import ANGLES, listed
 from polarguide.capture.write import (
     EXACT,
     intensity_codes,
-    picture_name,
     picture_names,
     rounded_radiance,
     suffix_of,
@@ -46,7 +44,6 @@ from polarguide.core.files import (
     check_out,
     holds_files,
     make_folder,
-    read_file,
     require_inside,
     write_whole,
     writing,
@@ -54,7 +51,7 @@ from polarguide.core.files import (
 from polarguide.core.progress import Reporter
 from polarguide.core.records import decode, option_name, read_record, shortened, to_json
 from polarguide.core.system import only_writer
-from polarguide.core.text import canonical, stem_of
+from polarguide.core.text import canonical
 from polarguide.preparation.filter_source import write_exposure_table
 from polarguide.preparation.journal import (
     Journal,
@@ -85,11 +82,6 @@ PARTIAL = ".sparse.partial"
 FOLDERS = ("polar", "invalid", "masks", "sparse")
 """Folders of a scene that a preparation writes into."""
 REMEDY = "Choose another --out. Nothing was written."
-# Angle in the name of a picture.
-_LABEL = r"(\d{3}(\.\d+)?|unknown|none)(-\d+)?"
-_POSE_SETTINGS = ("poses", "poses_of", "matching", "sfm_pictures", "intrinsics", "refine_intrinsics", "seed")
-_EARLIER_SETTINGS = {"analyzers": None, "angles": None, "poses_of": "auto", "shots_per_view": None}
-"""Values of settings that were added later, for journals of earlier versions."""
 
 
 class SceneFolder:
@@ -100,8 +92,7 @@ class SceneFolder:
 
         Args:
             root: the folder.
-            request: source, files and settings of this call. They must equal those of an earlier call, except that
-                poses may be added to a scene without poses.
+            request: source, files and settings of this call. They must equal those of an earlier call.
             measured_type: type of the measurements of the source.
 
         Raises:
@@ -109,16 +100,12 @@ class SceneFolder:
         """
         self.root = root
         self.state = State[Any](request)
-        self.finished = False
-        self._finished_before: bytes | None = None
         self._existed = root.exists()
         check_out(root)
-        finished = root / SCENE
         unfinished = root / JOURNAL
-        path = unfinished if unfinished.exists() else finished
-        if path.exists():
-            follows_none = self._resume(path, request, measured_type)
-            self.finished = path == finished and not follows_none
+        self.finished = (root / SCENE).exists() and not unfinished.exists()
+        if self.finished or unfinished.exists():
+            self._resume(root / SCENE if self.finished else unfinished, request, measured_type)
         elif root.exists() and holds_files(root):
             raise PolarguideError(
                 root,
@@ -127,8 +114,8 @@ class SceneFolder:
                 remedy=REMEDY,
             )
 
-    def _resume(self, path: Path, request: Request, measured_type: type[Measured]) -> bool:
-        """Read the state of an earlier call. Return True if this call adds poses to views without poses."""
+    def _resume(self, path: Path, request: Request, measured_type: type[Measured]) -> None:
+        """Read the state of an earlier call."""
         content = read_record(path, dict[str, Any])
         if "prepare" not in content:
             raise PolarguideError(
@@ -139,22 +126,10 @@ class SceneFolder:
             )
         journal: Journal[Any] = decode(content, Journal[measured_type], path, remedy=REMEDY)  # type: ignore[valid-type]
         before = journal.prepare
-        for view, record in before.views.items():
-            _require_own_files(path, view, record.files)
-            if before.request.format == "singles":
+        if before.request.format == "singles":
+            for view, record in before.views.items():
                 _require_exposures(path, view, record)
-        settings = {**_EARLIER_SETTINGS, **before.request.settings}
-        now = dict(request.settings)
-        if settings.get("white_balance") == "grey":  # spelling in journals of earlier versions
-            settings["white_balance"] = "gray"
-        if settings.get("matching") == "exhaustive" and now["matching"] == "auto":
-            now["matching"] = "exhaustive"  # default of earlier versions
-        follows_none = settings.get("poses") == "none" != now["poses"]
-        if follows_none:
-            settings |= {name: now[name] for name in _POSE_SETTINGS}
-        model = request.model if follows_none else before.request.model
-        old = msgspec.structs.replace(before.request, settings=settings, model=model)
-        difference = changed_entry(old, msgspec.structs.replace(request, settings=now))
+        difference = changed_entry(before.request, request)
         if difference is not None:
             name, was, is_now = difference
             raise PolarguideError(
@@ -165,7 +140,6 @@ class SceneFolder:
             )
         views = {canonical(view): record for view, record in before.views.items()}
         self.state = State(request, before.measured, views)
-        return follows_none
 
     @property
     def views(self) -> dict[str, ViewRecord]:
@@ -198,30 +172,19 @@ class SceneFolder:
         """Write the request to the journal."""
         work = self.root / SFM
         require_inside(self.root, *(self.root / name for name in (*FOLDERS, PARTIAL, SFM)), *work.rglob("*"))
-        if (self.root / SCENE).exists():
-            self._finished_before = read_file(self.root / SCENE)
         make_folder(self.root)
         self.save()  # first, because a later call resumes from it
         make_folder(self.root / "polar")
         make_folder(self.root / "invalid")
-        (self.root / SCENE).unlink(missing_ok=True)
 
     def abandon(self) -> None:
-        """Undo this call: restore a scene without poses, or remove a new folder.
-
-        Views from an earlier call remain for the next call.
-        """
-        shutil.rmtree(self.root / SFM, ignore_errors=True)
-        if self._finished_before is not None:
-            write_whole(self.root / SCENE, self._finished_before)
-            (self.root / JOURNAL).unlink(missing_ok=True)
-        elif not self.views:
-            for name in FOLDERS:
-                shutil.rmtree(self.root / name, ignore_errors=True)
-            (self.root / JOURNAL).unlink(missing_ok=True)
-            if not self._existed:
-                with contextlib.suppress(OSError):  # another process added files
-                    self.root.rmdir()
+        """Undo a preparation that has written no view."""
+        for name in (SFM, *FOLDERS):
+            shutil.rmtree(self.root / name, ignore_errors=True)
+        (self.root / JOURNAL).unlink(missing_ok=True)
+        if not self._existed:
+            with contextlib.suppress(OSError):  # another process added files
+                self.root.rmdir()
 
     def save(self) -> None:
         """Write the journal."""
@@ -232,40 +195,12 @@ class SceneFolder:
         write_whole(self.root / SCENE, to_json({**summary, "prepare": msgspec.to_builtins(self.state)}))
         (self.root / JOURNAL).unlink(missing_ok=True)
 
-    def has(self, view: str, warp: WarpRecord | None) -> bool:
-        """Return True if the folder contains all files of a view, with the given lens distortion removed."""
+    def has(self, view: str) -> bool:
+        """Return True if the folder contains all files of a view."""
         record = self.views.get(view)
-        return (
-            record is not None
-            and record.warp == warp
-            and all(
-                (self.root / name).is_file() and (self.root / name).stat().st_size == size
-                for name, size in record.files.items()
-            )
-        )
-
-    def drop(self, view: str) -> None:
-        """Remove a view that an earlier call wrote without poses."""
-        for name in self.views.pop(view).files:
-            (self.root / name).unlink(missing_ok=True)
-        self.save()
-
-
-def _require_own_files(journal: Path, view: str, files: Iterable[str]) -> None:
-    """Check that a journal lists only files of the named view. Listed files may be removed later.
-
-    Raises:
-        PolarguideError: the journal lists a file of another view or folder.
-    """
-    pictures = re.compile(rf"polar/{re.escape(view)}_{_LABEL}\.(png|tif)")
-    own = {f"invalid/{view}.png", f"masks/{view}.png"}
-    others = sorted(name for name in set(files) - own if not pictures.fullmatch(name))
-    if others or set(view) & set("/\\\0"):
-        raise PolarguideError(
-            f"{journal} (views, {shortened(view)})",
-            expected=f"pictures of this view, {picture_name('VIEW', 0)} and so on",
-            found=shortened(others[0] if others else view),
-            remedy=REMEDY,
+        return record is not None and all(
+            (self.root / name).is_file() and (self.root / name).stat().st_size == size
+            for name, size in record.files.items()
         )
 
 
@@ -348,9 +283,6 @@ class PoseEstimation:
         measured = self._folder.measured
         known = measured.photographs or {}
         measured.photographs = known
-        if images.is_dir() and any(stem_of(path) not in views for path in images.iterdir()):
-            shutil.rmtree(self._root, ignore_errors=True)  # from an earlier call with other poses
-            known.clear()
         for path in (images, masks):
             make_folder(path)
         with self._reporter.track("photographs", len(views)) as advance:
@@ -447,14 +379,9 @@ def prepare_scene(
     frames = ""
     if poses is not None and settings.poses != "dataset":
         frames = settle_pose_frames(pictures, poses, settings.poses_of)
-    request = request_of(
-        root,
-        [target / JOURNAL, target / SCENE],
-        pictures.kind,
-        settings.record(),
-        [*pictures.paths, *pictures.masks.values()],
-        poses.files if poses is not None else (),
-    )
+    model = () if poses is None else poses.files
+    files = [*pictures.paths, *pictures.masks.values(), *model]
+    request = request_of(root, pictures.kind, settings.record(), files)
     folder = SceneFolder(target, request, pictures.measured_type)
     if folder.finished:
         reporter.say(f"{target} is already complete.")
@@ -556,20 +483,11 @@ def _without_poses(root: Path, pictures: Source, settings: PrepareSettings) -> s
 
 def _write_views(folder: SceneFolder, pictures: Source, poses: Poses | None, reporter: Reporter) -> None:
     views = pictures.views if poses is None else poses.views
-    for view in folder.views.keys() - set(views):
-        folder.drop(view)
     faults: list[str] = []
     notes: list[str] = []
     with reporter.track("writing views", len(views)) as advance:
         for count, view in enumerate(views, 1):
-            known = folder.views.get(view)
-            warp = None
-            if known is not None and known.turned and pictures.used_as_stored(view):
-                folder.drop(view)  # an earlier call without poses rotated it for display
-                known = None
-            if known is not None and poses is not None:
-                warp = _warp_record(poses.warp(view, known.geometry))
-            if not folder.has(view, warp):
+            if not folder.has(view):
                 view_faults, view_notes = _write_view(folder, pictures, view, poses)
                 faults += view_faults
                 notes += view_notes
@@ -604,7 +522,8 @@ def _write_view(
         warp = poses.warp(view, record.geometry)
         intensities, invalid = warp.apply(intensities, invalid)
         mask = None if mask is None else warp.apply_mask(mask)
-        record.warp = _warp_record(warp)
+        removed = warp.record()
+        record.warp = None if removed is None else WarpRecord(**removed)
     rounding = getattr(folder.measured, "rounding", EXACT)
     if not folder.measured.bracketed:
         codes: NDArray[Any] = intensity_codes(intensities, invalid, rounding)
@@ -629,12 +548,6 @@ def _write_view(
     return faults, done.notes
 
 
-def _warp_record(warp: Undistortion) -> WarpRecord | None:
-    """Return the record of a removed lens distortion, or None if the lens has no distortion."""
-    record = warp.record()
-    return None if record is None else WarpRecord(**record)
-
-
 def _turns(folder: SceneFolder) -> str:
     """Return a note on the views that were rotated for display. The note is empty if there are no such views."""
     records = [record for record in folder.views.values() if record.turned]
@@ -656,6 +569,8 @@ def _write_model(folder: SceneFolder, poses: Poses) -> None:
     for old in (partial, final):
         shutil.rmtree(old, ignore_errors=True)
     make_folder(partial / "sparse" / "0")
+    for view in poses.views:
+        poses.warp(view, folder.views[view].geometry)
     poses.write(partial / "sparse" / "0")
     model = read_model(partial)
     for view in poses.views:
