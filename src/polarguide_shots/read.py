@@ -551,7 +551,7 @@ def develop_mosaic(shot: ExposureSet, options: ShotOptions, part: Part | None) -
     levels = replace(levels, gamma=options.gamma)
     assert options.sensor is not None
     require_kind(options.sensor, sample_blocks(values, SIDE), levels)
-    ratio, _ = files.light_of_blocks([sample_blocks(values, 2 * pattern.period)], levels, dark, values.shape)
+    ratio = files.ratio_of_blocks([sample_blocks(values, 2 * pattern.period)], levels, dark, values.shape)
     gains, gain_notes = pair_gains(ratio, options, _GAINS, calibrated=files.analyzers is not None)
     mode = options.demosaic
     way = options.interpolation

@@ -14,7 +14,6 @@ import pycolmap
 import pytest
 from camera_files import (
     COLOR,
-    MONO,
     behind,
     mosaic,
     read_invalid,
@@ -242,20 +241,6 @@ def test_masks_have_to_fit(tmp_path: Path) -> None:
     Fault("v0.png", expected="the size of the picture").raised_by(
         prepare_scene, tmp_path / "in", tmp_path / "out", settings
     )
-
-
-def test_poses_may_follow_on_none(tmp_path: Path) -> None:
-    for name in NAMES:
-        write_mosaic(tmp_path / "in" / f"{name}.png", mosaic(behind(smooth_light(color=False)), MONO))
-    settings = replace(MOSAIC, sensor="IMX250MZR", poses="none")
-    prepare_scene(tmp_path / "in", tmp_path / "out", settings)
-    written = (tmp_path / "out" / "polar" / "v000_000.png").stat().st_mtime_ns
-    model = write_model(tmp_path / "model", NAMES[:2], "PINHOLE 64 48 80 82 32 24")
-    done = prepare_scene(tmp_path / "in", tmp_path / "out", replace(settings, poses=str(model)))
-    assert done.new
-    assert done.left_out == ["v002"]
-    assert (tmp_path / "out" / "polar" / "v000_000.png").stat().st_mtime_ns == written
-    assert len(load_scene(tmp_path / "out").views) == 2
 
 
 @pytest.mark.parametrize(("files", "model"), [("NFD", "NFC"), ("NFC", "NFD")])

@@ -82,7 +82,7 @@ from polarguide.preparation.journal import (
     ViewRecord,
     stops_record,
 )
-from polarguide.preparation.settings import FilterSettings, SinglesSettings, white_gains
+from polarguide.preparation.settings import FilterSettings, SinglesSettings
 from polarguide.preparation.source import DevelopedView, Source, Stored
 
 _JUDGED_VIEWS = 8
@@ -130,30 +130,20 @@ class ShotsSource(Source):
             settings: settings of the preparation.
 
         Raises:
-            PolarguideError: the white balance or the transfer function does not fit the files.
+            PolarguideError: the transfer function does not fit the files.
         """
         self._settings = settings
         self._of_view = views
         self.paths = paths
         self.views = sorted(views)
         self._shots = [path for view in self.views for path in views[view]]
-        raw = [path for path in self._shots if is_camera_raw(path)]
-        white = white_gains(settings.white_balance)
-        if white is None or (white != (1.0, 1.0, 1.0) and len(raw) < len(self._shots)):
-            raise PolarguideError(
-                "--white-balance",
-                expected="none for pictures; none or three gains for camera raw",
-                found=settings.white_balance,
-                remedy="Remove the option.",
-            )
-        if raw and settings.transfer == "srgb":
+        if settings.transfer == "srgb" and any(map(is_camera_raw, self._shots)):
             raise PolarguideError(
                 "--transfer",
                 expected="auto or linear for camera raw, which is developed without tone curve",
                 found="srgb",
                 remedy="Remove the option.",
             )
-        self._white = white
         self._as_stored: frozenset[str] = frozenset()
 
     def stored(self, view: str) -> Stored:
@@ -204,9 +194,7 @@ class ShotsSource(Source):
         decision = transfer_of_pictures(
             self._shots,
             self._settings.transfer,
-            lambda: [
-                (read_stack(self._of_view[view], self._white, levels), self._angles(view)) for view in views
-            ],
+            lambda: [(read_stack(self._of_view[view], levels), self._angles(view)) for view in views],
         )
         if decision.doubt:
             warnings.warn(decision.doubt, PolarguideWarning, stacklevel=2)
@@ -219,7 +207,7 @@ class ShotsSource(Source):
         rounded.
         """
         first = self._shots[:1]
-        if self._settings.precision == "full" or read_stack(first, self._white).pictures.dtype != np.uint8:
+        if self._settings.precision == "full" or read_stack(first).pictures.dtype != np.uint8:
             return tuple(EXACT)
         levels = np.arange(256) / 255
         if transfer == "srgb":
@@ -235,7 +223,7 @@ class ShotsSource(Source):
         return self._merged(view, measured.levels, measured.transfer, align=align)
 
     def _merged(self, view: str, levels: Levels | None, transfer: str, *, align: bool) -> LinearShots:
-        read = BracketedShots.read(self._of_view[view], self._white, levels)
+        read = BracketedShots.read(self._of_view[view], levels)
         if self.used_as_stored(view):
             read = replace(read, shots=[replace(shots, orientation=1) for shots in read.shots])
         return LinearShots.of(read, transfer, align=align)
@@ -308,7 +296,7 @@ class FilterSource(ShotsSource):
         self._require_memory("four shots")
         settings = self._settings
         gains = settings.calibration.gains
-        levels, level_notes = levels_of_pictures(all_exposures(self._shots), self._white, self._settings)
+        levels, level_notes = levels_of_pictures(all_exposures(self._shots), self._settings)
         decision = self._decide_transfer(levels)
         stated, missing = stated_exposures(self._of_view, advance) if settings.gains != "none" else ({}, "")
         # One scale for all shots, with headroom for the largest gain that is corrected.
@@ -427,7 +415,7 @@ class SinglesSource(ShotsSource):
             "photographs of one kind of file",
             COMPARABLE,
         )
-        levels, level_notes = levels_of_pictures(all_exposures(self._shots), self._white, self._settings)
+        levels, level_notes = levels_of_pictures(all_exposures(self._shots), self._settings)
         decision = self._decide_transfer(levels)
         stated, missing = light_of_files(self._of_view, advance)
         light = {self._name(path): value for path, value in stated.items()}

@@ -38,12 +38,10 @@ class PictureSettings(SampledOptions):
     """Settings of sources whose pictures are developed from camera files.
 
     Attributes:
-        white_balance: none, gray (the mean color becomes gray), or gains of R, G and B such as 1.9,1,1.6.
         precision: source rounds the intensities to less than a fifth of a step of the camera's values. full keeps 16
             bits in larger files.
     """
 
-    white_balance: str = "none"
     precision: Literal["source", "full"] = "source"
 
 
@@ -140,7 +138,6 @@ class PrepareSettings(RawOptions, MosaicSettings, SinglesSettings):
             PolarguideError: a value is out of range.
         """
         self.require_valid()
-        white_gains(self.white_balance)
         if self.analyzers is not None and self.calibration.gains is not None:
             raise PolarguideError(
                 "calibration (gains)",
@@ -166,7 +163,6 @@ class PrepareSettings(RawOptions, MosaicSettings, SinglesSettings):
             )
         return replace(
             self,
-            white_balance="gray" if self.white_balance == "grey" else self.white_balance,
             dark_frame=_absolute(self.dark_frame),
             analyzers=_absolute(self.analyzers),
             angles=os.path.realpath(self.angles)
@@ -264,27 +260,6 @@ def settings_of_format(settings: PrepareSettings, kind: str) -> GainOptions:
             remedy="Remove the gains; order, sense and zero apply.",
         )
     return owner(**{f.name: getattr(settings, f.name) for f in dataclasses.fields(owner)})
-
-
-def white_gains(text: str) -> tuple[float, float, float] | None:
-    """Parse the gains of R, G and B from ``--white-balance``.
-
-    Return None for "gray", whose gains are measured in the pictures.
-
-    Raises:
-        PolarguideError: the text is invalid.
-    """
-    if text in ("none", "gray", "grey"):
-        return (1.0, 1.0, 1.0) if text == "none" else None
-    gains = decimals(text)
-    if len(gains) != 3 or not all(0.05 <= gain <= 20 for gain in gains):
-        raise PolarguideError(
-            "--white-balance",
-            expected="none, gray, or three gains from 0.05 to 20 such as 1.9,1,1.6",
-            found=repr(text),
-            remedy="Measure the gains in a picture of a gray card.",
-        )
-    return gains[0], gains[1], gains[2]
 
 
 def known_intrinsics(text: str) -> tuple[str, tuple[float, ...]]:

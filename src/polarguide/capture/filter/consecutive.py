@@ -70,7 +70,7 @@ def numbered_like_angles(paths: Sequence[Path]) -> list[Path]:
 def _edges(path: Path) -> NDArray[np.float32]:
     """Return a small gray picture without low frequencies, with a standard deviation of 1."""
     raw = is_camera_raw(path)
-    pixels = read_camera_raw(path, (1.0, 1.0, 1.0))[0] if raw else decode_picture(path, read_picture(path))
+    pixels = read_camera_raw(path)[0] if raw else decode_picture(path, read_picture(path))
     small = cv2.resize(
         np.sqrt(pixels.mean(axis=2, dtype=np.float32)), (_SIDE, _SIDE), interpolation=cv2.INTER_AREA
     )

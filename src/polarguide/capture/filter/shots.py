@@ -199,23 +199,18 @@ def require_four_shots(root: Path, shots: dict[str, dict[int, Path]]) -> None:
             )
 
 
-def read_stack(
-    paths: Sequence[Path],
-    gains: tuple[float, float, float] = (1.0, 1.0, 1.0),
-    levels: Levels | None = None,
-) -> Shots:
+def read_stack(paths: Sequence[Path], levels: Levels | None = None) -> Shots:
     """Read the shots of a view. There may be any number of shots.
 
     Args:
         paths: files of the shots.
-        gains: gains of R, G and B for camera raw files.
         levels: levels of the stored values. The values are rescaled so that full scale is the largest value of their
             type. By default, the files already have this full scale.
 
     Raises:
         PolarguideError: a file cannot be read, or files differ in size, depth or orientation.
     """
-    pictures, codes = zip(*(_read_shot(path, gains) for path in paths), strict=True)
+    pictures, codes = zip(*map(_read_shot, paths), strict=True)
     for path, picture, code in zip(paths, pictures, codes, strict=True):
         require_alike(path, picture, paths[0], pictures[0])
         if code != codes[0]:
@@ -249,10 +244,10 @@ def stacked(
     return Shots(stack, orientation, np.asarray(top >= limit), ~top.any(axis=0))
 
 
-def _read_shot(path: Path, gains: tuple[float, float, float]) -> tuple[NDArray[Any], int]:
+def _read_shot(path: Path) -> tuple[NDArray[Any], int]:
     """Read a shot, and return its stored values [H, W, 3] and its EXIF orientation."""
     if is_camera_raw(path):
-        return read_camera_raw(path, gains)
+        return read_camera_raw(path)
     data = read_picture(path)
     return decode_picture(path, data), orientation(data)
 
