@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import struct
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -148,37 +147,6 @@ def test_a_file_that_is_damaged_is_refused_with_one_line(saved: Path, how: str) 
     saved.write_bytes(spoil(saved.read_bytes()))
     error = Fault(str(saved)).raised_by(read_analyzers, saved)
     assert expected in str(error)
-
-
-def test_a_file_with_its_checksum_that_makes_no_sense_is_refused(tmp_path: Path) -> None:
-    good = true_calibration(made_sensor("IMX250MZR", (24, 32)))
-    alike = np.broadcast_to(good.vectors[:, :, :1, :1], good.vectors.shape)
-    for vectors in (good.vectors * np.nan, good.vectors * [1, 0, 0], good.vectors[:2], alike):
-        bad = AnalyzerCalibration("IMX250MZR", "", (0, 0), (32, 24), 2, vectors.astype(np.float32), "mean")
-        write_analyzers(tmp_path / "bad.safetensors", bad)
-        Fault("bad.safetensors", expected="a file that polarguide calibrate").raised_by(
-            read_analyzers, tmp_path / "bad.safetensors"
-        )
-
-
-@pytest.mark.parametrize("name", SENSORS)
-@pytest.mark.parametrize(
-    ("factor", "turned", "fault"),
-    [
-        (1e30, False, Fault(found="throughputs of")),
-        (1e-30, False, Fault(found="throughputs of")),
-        (1, True, Fault(found="far from the sensor's angles")),
-    ],
-)
-def test_vectors_that_no_sensor_has_are_refused(
-    tmp_path: Path, name: str, factor: float, turned: bool, fault: Fault
-) -> None:
-    calibration = true_calibration(made_sensor(name, (16, 24)))
-    vectors = calibration.vectors * np.float32(factor)
-    if turned:  # every polarizer as the first one of its block
-        vectors[:] = vectors[:, :, :1, :1]
-    write_analyzers(tmp_path / "a.safetensors", replace(calibration, vectors=vectors))
-    fault.raised_by(read_analyzers, tmp_path / "a.safetensors")
 
 
 def test_other_sizes_and_sensors_are_refused(saved: Path) -> None:

@@ -328,7 +328,6 @@ def choices(hint: Any) -> set[str]:
         ("sensor", set(SENSORS)),
         ("packing", set(PACKINGS)),
         ("demosaic", set(DEMOSAIC_MODES)),
-        ("interpolation", set(("bilinear", "guided"))),
     ],
 )
 def test_options_offer_what_there_is(field: str, known: set[str]) -> None:

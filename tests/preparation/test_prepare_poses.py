@@ -202,7 +202,6 @@ def test_pictures_for_sfm_with_less_glare() -> None:
     [
         ({"intrinsics": "260,260,160"}, Fault("--intrinsics", expected="fx,fy,cx,cy or")),
         ({"intrinsics": "260,0,160,120"}, Fault("--intrinsics", expected="fx,fy,cx,cy or")),
-        ({"refine_intrinsics": True}, Fault("--refine-intrinsics", expected="initial values")),
         ({"intrinsics": "9,9,9,9", "poses": "none"}, Fault(expected="--poses sfm")),
         ({"masks": "nowhere"}, Fault("--masks", expected="a folder of masks")),
     ],

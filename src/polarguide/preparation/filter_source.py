@@ -559,7 +559,6 @@ def reconciled(
 
 # Smallest unusual deviation of a gain's logarithm (1.5 stops). A warning follows unless a file states this gain.
 _FAR = math.log(2.0) * 1.5
-_LISTED = 12
 
 
 @dataclass
@@ -620,7 +619,6 @@ def write_exposure_table(
     for picture in pictures:
         picture.record.gain = float(f"{math.exp(picture.log):.6g}")
         picture.record.points = picture.points
-    _say_table(pictures, reporter)
     # Names are not escaped, because the table is read again.
     rows = [(p.file, p.view, angle_text(p.record.angle), f"{p.record.gain:.6g}") for p in pictures]
     text = io.StringIO()
@@ -766,27 +764,3 @@ def _warn(
             reporter.warn(
                 f"The exposures of {len(far)} pictures differ from the others by more than 1.5 stops ({listed(far)})."
             )
-
-
-def _say_table(pictures: list[PictureRow], reporter: Reporter) -> None:
-    """Print the gains of all pictures, or only the most unusual ones if there are many.
-
-    Print nothing if all gains are 1.
-    """
-    if all(picture.record.gain == 1 for picture in pictures):
-        return
-    listing = pictures
-    if len(pictures) > _LISTED:
-        listing = sorted(
-            sorted(pictures, key=lambda p: -abs(p.log))[:_LISTED], key=lambda p: (p.view, p.file)
-        )
-    width = max(len("picture"), *(len(picture.file) for picture in listing))
-    rows = [f"{'picture':<{width}}   angle    gain  stops  points"]
-    for picture in listing:
-        gain = picture.record.gain or 1.0
-        angle = angle_text(picture.record.angle)
-        stops = f"{math.log2(gain):+.2f}"
-        rows.append(f"{picture.file:<{width}} {angle:>7} {gain:>7.3f} {stops:>6} {picture.points:>7}")
-    if len(listing) < len(pictures):
-        rows.append(f"... and {len(pictures) - len(listing)} closer to the mean; {TABLE} lists all.")
-    reporter.say("\n".join(rows))

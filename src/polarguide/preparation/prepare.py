@@ -251,7 +251,6 @@ class PoseEstimation:
             reporter=self._reporter,
             untried=_untried(settings, self._pictures.kind),
             intrinsics=None if settings.intrinsics is None else known_intrinsics(settings.intrinsics),
-            refine=settings.refine_intrinsics,
             lenses=self._pictures.lenses(),
         )
 

@@ -116,7 +116,6 @@ class PrepareSettings(RawOptions, MosaicSettings, SinglesSettings):
             more than 100 pictures with consecutive numbers.
         sfm_pictures: Pictures for SfM. The photograph, or the minimum over the angles, which has less glare.
         intrinsics: fx,fy,cx,cy (and k1,k2,p1,p2) of all developed pictures, for SfM. By default, they are estimated.
-        refine_intrinsics: Let SfM refine the specified focal lengths and distortion.
         masks: Folder of object masks named like the views. SfM uses only their white parts.
         seed: Seed of SfM.
     """
@@ -127,7 +126,6 @@ class PrepareSettings(RawOptions, MosaicSettings, SinglesSettings):
     matching: Literal["auto", "exhaustive", "sequential"] = "auto"
     sfm_pictures: Literal["photograph", "minimum"] = "photograph"
     intrinsics: str | None = None
-    refine_intrinsics: bool = False
     masks: Path | None = None
     seed: Annotated[int, Meta(ge=0, lt=2**31)] = 0
 
@@ -154,13 +152,6 @@ class PrepareSettings(RawOptions, MosaicSettings, SinglesSettings):
             )
         if self.intrinsics is not None:
             known_intrinsics(self.intrinsics)
-        elif self.refine_intrinsics:
-            raise PolarguideError(
-                "--refine-intrinsics",
-                expected="initial values in --intrinsics",
-                found="no --intrinsics",
-                remedy="Remove the option: unknown intrinsics are always estimated.",
-            )
         return replace(
             self,
             dark_frame=_absolute(self.dark_frame),

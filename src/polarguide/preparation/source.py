@@ -581,7 +581,7 @@ class MosaicSource(Source):
         settings = self._settings
         picture = demosaic(
             linear, bad, self._mosaics.pattern,
-            mode=settings.demosaic, interpolation=settings.interpolation, registered=settings.register,
+            mode=settings.demosaic, registered=settings.register,
         )  # fmt: skip
         largest = None if measured.bracketed else 1.0
         intensities = oriented(np.clip(picture.intensities, 0.0, largest), settings.calibration)

@@ -36,11 +36,10 @@ _KINDS = re.compile(
 )
 """Pattern that recognizes kinds of picture files by their first bytes."""
 TIFFS = ("TIFF", "BigTIFF")
-# The end of JPEG scan data. In the data, 0xFF is followed by 0 (a stuffed byte) or by 0xD0-0xD7 (a restart).
-_JPEG_SCAN_END = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")
+# Markers of JPEG files. In scan data, 0xFF is followed by 0 (a stuffed byte) or by 0xD0-0xD7 (a restart).
+_START_OF_SCAN = b"\xff\xda"
+_END_OF_IMAGE = b"\xff\xd9"
 ORIENTATION = 274
-# JPEG markers that no length follows: an unused marker, and restarts.
-_JPEG_ALONE = (0x01, *range(0xD0, 0xD8))
 # Largest number of scans of a progressive JPEG file. Encoders write about ten. Even an empty scan takes time to decode.
 _MOST_SCANS = 200
 LARGEST_PIXELS = 150_000_000
@@ -115,24 +114,6 @@ def significant_bits(data: bytes) -> int | None:
     return max(stated[:3] if len(stated) > 2 else stated[:1]) if stated else None
 
 
-def _jpeg_marks(data: bytes) -> Iterator[int]:
-    """Yield the markers of the segments and scans of a JPEG file up to its end-of-image marker."""
-    at = 2
-    while at + 2 <= len(data) and data[at] == 0xFF:
-        kind = data[at + 1]
-        if kind == 0xFF:  # fill byte
-            at += 1
-        elif kind in _JPEG_ALONE:
-            at += 2
-        else:
-            yield kind
-            at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
-            mark = _JPEG_SCAN_END.search(data, at) if kind == 0xDA else None
-            at = at if mark is None else mark.start()
-            if kind == 0xD9 or (kind == 0xDA and mark is None):
-                return
-
-
 def _png_damage(data: bytes) -> str | None:
     """Describe the damage in the chunks of a PNG file, such as a wrong checksum. Return None if they are complete."""
     if declared_size(data) is None and len(data) >= 24:
@@ -153,14 +134,17 @@ def _png_damage(data: bytes) -> str | None:
 def _jpeg_damage(data: bytes) -> str | None:
     """Describe the damage in the structure of a JPEG file. Return None if it is complete.
 
-    The file is damaged if it has no end-of-image marker, too many scans, or no size.
+    The file is damaged if it has no size, no end-of-image marker after its first scan, or too many scans.
     """
-    kinds = list(_jpeg_marks(data))
-    if 0xD9 not in kinds:
+    picture = _pillow_head(data)
+    start = 2 if picture is None else picture.fp.tell()
+    end = data.find(_END_OF_IMAGE, start)
+    scans = data.count(_START_OF_SCAN, start, end) + 1
+    if end < 0:
         return f"a JPEG file cut short (it ends after {len(data)} bytes)"
-    if kinds.count(0xDA) > _MOST_SCANS:
-        return f"a JPEG file of {kinds.count(0xDA)} scans"
-    return "a JPEG file without a size" if _pillow_head(data) is None else None
+    if scans > _MOST_SCANS:
+        return f"a JPEG file of {scans} scans"
+    return "a JPEG file without a size" if picture is None else None
 
 
 _PNM_HEAD = re.compile(
