@@ -67,7 +67,7 @@ from polarguide.capture.sensor.pattern import (
 from polarguide.capture.sensor.raw_file import RawFormat, read_mosaic, require_mosaic
 from polarguide.capture.view import FULL_CODE
 from polarguide.capture.view_reader import require_alike
-from polarguide.core.errors import PolarguideError
+from polarguide.core.errors import PolarguideError, require
 from polarguide.core.files import require_file
 from polarguide.core.progress import Advance
 from polarguide.geometry.polarizer import ANGLES
@@ -191,13 +191,13 @@ class MosaicFiles:
         if self._options.dark_frame is None:
             return None
         dark = self._turned_back(self._options.dark_frame, read_mosaic(self._options.dark_frame, self._raw))
-        if dark.shape != shape:
-            raise PolarguideError(
-                self._options.dark_frame,
-                expected=f"a dark frame of {shape[1]}x{shape[0]} pixels like the mosaics",
-                found=f"{dark.shape[1]}x{dark.shape[0]}",
-                remedy="Photograph it with the same region and settings, and with the lens covered.",
-            )
+        require(
+            dark.shape == shape,
+            self._options.dark_frame,
+            expected=f"a dark frame of {shape[1]}x{shape[0]} pixels like the mosaics",
+            found=f"{dark.shape[1]}x{dark.shape[0]}",
+            remedy="Photograph it with the same region and settings, and with the lens covered.",
+        )
         return self.cut(dark).astype(np.float32)
 
     def ratio_of_blocks(

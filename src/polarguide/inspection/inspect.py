@@ -20,7 +20,7 @@ from polarguide.capture import Scene, load_scene
 from polarguide.capture.angle_evidence import OrderEvidence, posterior
 from polarguide.capture.layout import refuse_scene
 from polarguide.capture.view import listed
-from polarguide.core.errors import PolarguideError
+from polarguide.core.errors import require
 from polarguide.core.files import check_out, require_inside
 from polarguide.core.options import index_of
 from polarguide.core.progress import SILENT, Reporter
@@ -443,8 +443,11 @@ def _training_scene(
         test_views=held_out,
         reporter=reporter,
     )
-    if not scene.train_views:
-        raise PolarguideError(
-            capture.root, expected="views to train on", found="none", remedy="Use --normals points."
-        )
+    require(
+        scene.train_views,
+        capture.root,
+        expected="views to train on",
+        found="none",
+        remedy="Use --normals points.",
+    )
     return scene

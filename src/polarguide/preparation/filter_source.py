@@ -70,7 +70,7 @@ from polarguide.capture.point_exposures import (
 from polarguide.capture.sensor.pattern import Levels
 from polarguide.capture.view import ANGLES, FULL_CODE, listed
 from polarguide.capture.write import EXACT, picture_names, rounding_of, suffix_of
-from polarguide.core.errors import PolarguideError, PolarguideWarning
+from polarguide.core.errors import PolarguideWarning, require
 from polarguide.core.files import write_whole
 from polarguide.core.progress import Advance, Reporter
 from polarguide.optics.color import srgb_decode_array
@@ -137,13 +137,13 @@ class ShotsSource(Source):
         self.paths = paths
         self.views = sorted(views)
         self._shots = [path for view in self.views for path in views[view]]
-        if settings.transfer == "srgb" and any(map(is_camera_raw, self._shots)):
-            raise PolarguideError(
-                "--transfer",
-                expected="auto or linear for camera raw, which is developed without tone curve",
-                found="srgb",
-                remedy="Remove the option.",
-            )
+        require(
+            settings.transfer != "srgb" or not any(map(is_camera_raw, self._shots)),
+            "--transfer",
+            expected="auto or linear for camera raw, which is developed without tone curve",
+            found="srgb",
+            remedy="Remove the option.",
+        )
         self._as_stored: frozenset[str] = frozenset()
 
     def stored(self, view: str) -> Stored:

@@ -39,7 +39,7 @@ from polarguide.capture.write import (
     write_png_file,
     write_view,
 )
-from polarguide.core.errors import PolarguideError
+from polarguide.core.errors import PolarguideError, require
 from polarguide.core.files import (
     check_out,
     holds_files,
@@ -117,13 +117,13 @@ class SceneFolder:
     def _resume(self, path: Path, request: Request, measured_type: type[Measured]) -> None:
         """Read the state of an earlier call."""
         content = read_record(path, dict[str, Any])
-        if "prepare" not in content:
-            raise PolarguideError(
-                self.root,
-                expected="a new folder, or one that prepare wrote",
-                found=f"a {path.name} of another origin",
-                remedy=REMEDY,
-            )
+        require(
+            "prepare" in content,
+            self.root,
+            expected="a new folder, or one that prepare wrote",
+            found=f"a {path.name} of another origin",
+            remedy=REMEDY,
+        )
         journal: Journal[Any] = decode(content, Journal[measured_type], path, remedy=REMEDY)  # type: ignore[valid-type]
         before = journal.prepare
         if before.request.format == "singles":
@@ -213,89 +213,84 @@ def _require_exposures(journal: Path, view: str, record: ViewRecord) -> None:
     angles = [exposure.angle for exposure in record.exposures or ()]
     named = picture_names(view, angles, suffix_of(record.files))
     pictures = sorted(name for name in record.files if name.startswith("polar/"))
-    if sorted(named) != pictures or not named:
-        raise PolarguideError(
-            f"{journal} (views, {shortened(view)})",
-            expected=f"the exposures of {shortened(pictures)}",
-            found=shortened(named),
-            remedy=REMEDY,
-        )
+    require(
+        sorted(named) == pictures and named,
+        f"{journal} (views, {shortened(view)})",
+        expected=f"the exposures of {shortened(pictures)}",
+        found=shortened(named),
+        remedy=REMEDY,
+    )
 
 
-class PoseEstimation:
-    """Estimation of camera poses and points, with temporary pictures in a hidden folder of the scene."""
+def _structure(folder: SceneFolder, pictures: Source, settings: PrepareSettings, reporter: Reporter) -> Path:
+    """Estimate the poses of all views by structure from motion, and return the folder of the COLMAP model.
 
-    def __init__(
-        self, folder: SceneFolder, pictures: Source, settings: PrepareSettings, reporter: Reporter
-    ) -> None:
-        self._folder = folder
-        self._pictures = pictures
-        self._settings = settings
-        self._reporter = reporter
-        self._root = folder.root / SFM
+    Raises:
+        PolarguideError: too few views are registered.
+    """
+    photographs = _photographs(folder, pictures, settings, reporter, pictures.views)
+    matching = chosen_matching(pictures.views, settings.matching, reporter)
+    settings = replace(settings, matching=matching)  # type: ignore[arg-type]
+    return reconstruct(
+        folder.root / SFM,
+        {view: geometry.size for view, geometry in photographs.items()},
+        matching=matching,
+        seed=settings.seed,
+        reporter=reporter,
+        untried=_untried(settings, pictures.kind),
+        intrinsics=None if settings.intrinsics is None else known_intrinsics(settings.intrinsics),
+        lenses=pictures.lenses(),
+    )
 
-    def structure(self) -> Path:
-        """Estimate the poses of all views by structure from motion, and return the folder of the COLMAP model.
 
-        Raises:
-            PolarguideError: too few views are registered.
-        """
-        sizes = {view: geometry.size for view, geometry in self._photographs(self._pictures.views).items()}
-        matching = chosen_matching(self._pictures.views, self._settings.matching, self._reporter)
-        settings = replace(self._settings, matching=matching)  # type: ignore[arg-type]
-        return reconstruct(
-            self._root,
-            sizes,
-            matching=matching,
-            seed=settings.seed,
-            reporter=self._reporter,
-            untried=_untried(settings, self._pictures.kind),
-            intrinsics=None if settings.intrinsics is None else known_intrinsics(settings.intrinsics),
-            lenses=self._pictures.lenses(),
-        )
+def _points(
+    folder: SceneFolder, pictures: Source, settings: PrepareSettings, poses: Poses, reporter: Reporter
+) -> tuple[Poses, dict[str, Any]]:
+    """Triangulate points for given poses.
 
-    def points(self, poses: Poses) -> tuple[Poses, dict[str, Any]]:
-        """Triangulate points for given poses.
+    Returns:
+        The poses with points; and a record of the triangulation.
 
-        Returns:
-            The poses with points; and a record of the triangulation.
+    Raises:
+        PolarguideError: the cameras do not look at a common place.
+    """
+    model, record = add_points(
+        folder.root / SFM,
+        poses.developed(_photographs(folder, pictures, settings, reporter, poses.views)),
+        poses.folder,
+        matching=chosen_matching(poses.views, settings.matching, reporter),
+        seed=settings.seed,
+        reporter=reporter,
+    )
+    return Poses.read(model, pictures.views), record
 
-        Raises:
-            PolarguideError: the cameras do not look at a common place.
-        """
-        cameras = poses.developed(self._photographs(poses.views))
-        settings = self._settings
-        model, record = add_points(
-            self._root,
-            cameras,
-            poses.folder,
-            matching=chosen_matching(poses.views, settings.matching, self._reporter),
-            seed=settings.seed,
-            reporter=self._reporter,
-        )
-        return Poses.read(model, self._pictures.views), record
 
-    def _photographs(self, views: list[str]) -> dict[str, Geometry]:
-        """Write tone-mapped pictures and object masks of views. Return size and orientation of each picture."""
-        images = self._root / "images"
-        masks = self._root / "masks"
-        measured = self._folder.measured
-        known = measured.photographs or {}
-        measured.photographs = known
-        for path in (images, masks):
-            make_folder(path)
-        with self._reporter.track("photographs", len(views)) as advance:
-            for count, view in enumerate(views, 1):
-                path = images / f"{view}.png"
-                if view not in known or not path.exists():
-                    done = develop_view(self._pictures, view, measured)
-                    if done.mask is not None:
-                        write_png_file(masks / f"{view}.png", done.mask.astype(np.uint8) * 255)
-                    write_png_file(path, tone_mapped(done.intensities, self._settings.sfm_pictures))
-                    known[view] = done.record.geometry
-                    self._folder.save()
-                advance(count)
-        return {view: known[view] for view in views}
+def _photographs(
+    folder: SceneFolder, pictures: Source, settings: PrepareSettings, reporter: Reporter, views: list[str]
+) -> dict[str, Geometry]:
+    """Write tone-mapped pictures and object masks of views to a hidden folder of the scene.
+
+    Returns:
+        Size and orientation of each picture by view.
+    """
+    images = folder.root / SFM / "images"
+    masks = folder.root / SFM / "masks"
+    known = folder.measured.photographs or {}
+    folder.measured.photographs = known
+    for path in (images, masks):
+        make_folder(path)
+    with reporter.track("photographs", len(views)) as advance:
+        for count, view in enumerate(views, 1):
+            path = images / f"{view}.png"
+            if view not in known or not path.exists():
+                done = develop_view(pictures, view, folder.measured)
+                if done.mask is not None:
+                    write_png_file(masks / f"{view}.png", done.mask.astype(np.uint8) * 255)
+                write_png_file(path, tone_mapped(done.intensities, settings.sfm_pictures))
+                known[view] = done.record.geometry
+                folder.save()
+            advance(count)
+    return {view: known[view] for view in views}
 
 
 def _untried(settings: PrepareSettings, kind: str) -> str:
@@ -360,13 +355,13 @@ def prepare_scene(
     root, settings = frames_of_video(Path(source), target, settings, reporter)
     pictures = open_source(root, settings)
     settings = replace(settings, poses=origin_of_poses(pictures, settings.poses))
-    if settings.poses != "sfm" and settings.intrinsics is not None:
-        raise PolarguideError(
-            "--intrinsics",
-            expected="--poses sfm with --intrinsics",
-            found=f"--poses {settings.poses}",
-            remedy="Omit --intrinsics: the poses contain the cameras.",
-        )
+    require(
+        settings.poses == "sfm" or settings.intrinsics is None,
+        "--intrinsics",
+        expected="--poses sfm with --intrinsics",
+        found=f"--poses {settings.poses}",
+        remedy="Omit --intrinsics: the poses contain the cameras.",
+    )
     if settings.poses == "sfm" and len(pictures.views) < LEAST_VIEWS:
         raise PolarguideError(
             root,
@@ -420,11 +415,10 @@ def _write_scene(
     """Write the missing parts of a scene whose capture has been measured."""
     tests = () if poses is None else poses.held_out
     folder.start()
-    work = PoseEstimation(folder, pictures, settings, reporter)
     points: dict[str, Any] | None = None
     if settings.poses == "sfm":
         try:
-            poses = Poses.read(work.structure(), pictures.views)
+            poses = Poses.read(_structure(folder, pictures, settings, reporter), pictures.views)
         except NotConnectedError as error:
             folder.abandon()
             raise PolarguideError(
@@ -435,7 +429,7 @@ def _write_scene(
             ) from None
         points = {"from": "structure from motion", "count": poses.points}
     elif poses is not None and not poses.points:
-        poses, points = work.points(poses)
+        poses, points = _points(folder, pictures, settings, poses, reporter)
     elif poses is not None:
         points = {"from": "the model given", "count": poses.points}
     if poses is not None and poses.missing:

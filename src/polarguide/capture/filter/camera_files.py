@@ -33,7 +33,7 @@ from polarguide.capture.formats.headers import (
     png_chunk,
 )
 from polarguide.capture.formats.pictures import array_kind, read_picture
-from polarguide.core.errors import PolarguideError, optional_import
+from polarguide.core.errors import PolarguideError, optional_import, require
 from polarguide.core.files import read_file
 from polarguide.core.text import listed
 
@@ -75,13 +75,13 @@ def read_camera_raw(
             # channels from the samples, but the black level of a fourth channel, 0, from the white level.
             black = raw.black_level_per_channel
             reached = float((raw.white_level - max(black[:3])) / (raw.white_level - min(black)) * _FULL)
-    if pixels.ndim != 3 or pixels.shape[2] != 3 or pixels.dtype != np.uint16:
-        raise PolarguideError(
-            path,
-            expected="a camera raw file with three colors",
-            found=array_kind(pixels),
-            remedy="Develop it to 16-bit linear TIFF.",
-        )
+    require(
+        pixels.ndim == 3 and pixels.shape[2] == 3 and pixels.dtype == np.uint16,
+        path,
+        expected="a camera raw file with three colors",
+        found=array_kind(pixels),
+        remedy="Develop it to 16-bit linear TIFF.",
+    )
     # The white level becomes 65535, which marks saturation. LibRaw rounds down.
     if reached < _FULL:
         pixels = np.minimum(np.rint(pixels * np.float32(_FULL / reached)), _FULL).astype(np.uint16)

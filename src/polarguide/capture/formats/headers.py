@@ -10,11 +10,11 @@ import contextlib
 import io
 import itertools
 import logging
+import math
 import re
 import struct
 import zlib
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from PIL.BmpImagePlugin import BmpImageFile
 from PIL.JpegImagePlugin import JpegImageFile
+from PIL.PpmImagePlugin import PpmImageFile
 from PIL.WebPImagePlugin import WebPImageFile
 
 from polarguide.core.errors import PolarguideError, optional_import
@@ -87,7 +88,7 @@ def declared_size(data: bytes) -> tuple[int, int] | None:
         return tiff_size(io.BytesIO(data))
     if kind == "HEIF":
         return _heif_size(data)
-    head = pnm_head(data) if kind == "PNM" else _pillow_head(data)
+    head = _pillow_head(data)
     return None if head is None else head.size
 
 
@@ -147,53 +148,18 @@ def _jpeg_damage(data: bytes) -> str | None:
     return "a JPEG file without a size" if picture is None else None
 
 
-_PNM_HEAD = re.compile(
-    rb"P[56](?:\s+|#[^\n]*\n)+?(\d{1,9})(?:\s+|#[^\n]*\n)+?(\d{1,9})(?:\s+|#[^\n]*\n)+?(\d{1,5})\s"
-)
-_LARGEST_HEAD = 4096
-
-
-@dataclass(frozen=True)
-class PnmHead:
-    """Header of a PGM or PPM file.
-
-    Attributes:
-        size: width and height.
-        full: stored value of full scale.
-        end: offset in the file at which the samples end.
-    """
-
-    size: tuple[int, int]
-    full: int
-    end: int
-
-
-def pnm_head(data: bytes) -> PnmHead | None:
-    """Parse the header of a PGM or PPM file. Return None if it is invalid."""
-    match = _PNM_HEAD.match(data[:_LARGEST_HEAD])
-    if match is None:
-        return None
-    width, height, full = (int(text) for text in match.groups())
-    samples = width * height * (1 if data[:2] == b"P5" else 3)
-    end = match.end() + samples * (1 if full < 256 else 2)
-    return PnmHead((width, height), full, end) if 0 < full < 1 << 16 else None
-
-
-def pnm_damage(data: bytes) -> str | None:
-    """Describe the damage in the structure of a PGM or PPM file. Return None if it is complete."""
-    head = pnm_head(data)
-    if head is None:
-        return "a PGM or PPM file without a size and full scale"
-    return None if head.end <= len(data) else f"a PGM or PPM file cut short (it ends after {len(data)} bytes)"
-
-
-_PILLOW: dict[str, Any] = {"BMP": BmpImageFile, "JPEG": JpegImageFile, "WebP": WebPImageFile}
+_PILLOW: dict[str, Any] = {
+    "BMP": BmpImageFile,
+    "JPEG": JpegImageFile,
+    "PNM": PpmImageFile,
+    "WebP": WebPImageFile,
+}
 
 
 def opened_picture(data: bytes) -> Any:
-    """Open a BMP, JPEG or WebP file with Pillow without decoding its pixels.
+    """Open a BMP, JPEG, PGM, PPM or WebP file with Pillow without decoding its pixels.
 
-    ``data`` may be the start of a BMP or JPEG file, but must be a whole WebP file.
+    ``data`` may be the start of a file, except for a WebP file, which must be whole.
 
     Raises:
         Exception: the file is damaged. Pillow raises several kinds of errors.
@@ -206,6 +172,26 @@ def _pillow_head(data: bytes) -> Any:
     with contextlib.suppress(Exception):
         return opened_picture(data)
     return None
+
+
+def pnm_full_scale(data: bytes) -> int | None:
+    """Return the stored value of full scale in the header of a PGM or PPM file. Return None for any other file."""
+    picture = _pillow_head(data) if picture_kind(data) == "PNM" else None
+    if picture is None:
+        return None
+    decoder, _, _, mode = picture.tile[0]
+    return int(mode[1]) if decoder == "ppm" else {"I;16B": 65535}.get(mode, 255)
+
+
+def pnm_damage(data: bytes) -> str | None:
+    """Describe the damage in the structure of a PGM or PPM file. Return None if it is complete."""
+    picture = _pillow_head(data)
+    full = pnm_full_scale(data)
+    if picture is None or full is None:
+        return "a PGM or PPM file without a size and full scale"
+    samples = math.prod(picture.size) * len(picture.getbands())
+    end = picture.tile[0][2] + samples * (1 if full < 256 else 2)
+    return None if end <= len(data) else f"a PGM or PPM file cut short (it ends after {len(data)} bytes)"
 
 
 def pillow_damage(data: bytes) -> str | None:

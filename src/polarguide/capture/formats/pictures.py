@@ -30,7 +30,7 @@ from polarguide.capture.formats.headers import (
     find_damage,
     heif_pixels,
     picture_kind,
-    pnm_head,
+    pnm_full_scale,
     rescaled,
     significant_bits,
     tiff_full_scale,
@@ -615,10 +615,9 @@ def stated_full_scale(path: Path, file: BinaryIO, samples: NDArray[Any]) -> int 
     kind = picture_kind(head)
     if kind == "PNG":
         return _full_of_significant(colors, significant_bits(head))
-    full = None
-    plain = pnm_head(head)
-    if plain is not None:
-        full = plain.full if plain.full < np.iinfo(samples.dtype).max else None
+    full = pnm_full_scale(head)
+    if full == np.iinfo(samples.dtype).max:
+        full = None
     elif kind in TIFFS:
         file.seek(0)
         with tifffile.TiffFile(file) as tiff:
