@@ -298,7 +298,7 @@ def find_single_shots(
         angles is None or not table.exists() or Path(angles).resolve() == table.resolve(),
         "--angles",
         expected=f"no --angles with {table}, which states the angles",
-        found=angles,
+        found=str(angles),
         remedy="Omit the option, or move the table to another folder.",
     )
     if angles is not None and not angles.lower().endswith(".csv"):
