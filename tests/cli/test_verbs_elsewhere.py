@@ -93,20 +93,13 @@ def test_pictures_by_other_light_and_along_a_path(elsewhere: Path, tmp_path: Pat
 
 
 def test_the_inspection_trains_there_and_compares_here(
-    demo_scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    demo_scene: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("polarguide.gaussians.gaussians.adam", unfused_adam)
     scene = load_scene(demo_scene, downscale=8)
-
-    def stop(report: object) -> None:
-        raise KeyboardInterrupt
-
     with OtherDevice():
-        with pytest.raises(KeyboardInterrupt):
-            short_run(scene, tmp_path, steps=2, backend=BACKEND, on_step=stop)
-        state = short_run(scene, tmp_path, steps=2, backend=BACKEND, on_step=lambda _: None)
+        state = short_run(scene, steps=2, backend=BACKEND, on_step=lambda _: None)
         surface = trained_surface(state, scene.views[0], BACKEND)
-    assert json.loads((tmp_path / "short_run.json").read_text())["steps"] == 2
     assert state.step == 2
     assert {t.device.type for t in (surface.normal, surface.depth, surface.known)} == {"cpu"}
 
