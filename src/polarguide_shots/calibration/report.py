@@ -142,7 +142,9 @@ def calibration_picture(
     """
     columns = len(_KINDS) * len(analyzers) // len(ANGLES)
     figure = Figure(figsize=(2 + 2.6 * columns, 14), layout="constrained")
-    top, bottom = figure.subfigures(2, 1, height_ratios=(1, 2.5))
+    rows = figure.add_gridspec(2, 1, height_ratios=(1, 2.5))
+    top = figure.add_subfigure(rows[0])
+    bottom = figure.add_subfigure(rows[1])
     lens = f", {calibration.lens}" if calibration.lens else ""
     block = calibration.block
     blocks = "single pixels" if block == calibration.pattern.period else f"blocks of {block} pixels"
