@@ -117,11 +117,9 @@ LEFT, RIGHT = (camera((x, 0.0, 0.0), (x, 0.0, WALL)) for x in (-1.0, 1.0))
 def test_two_views_confirm_a_wall():
     nearest = ConfirmedSurfaces([wall(LEFT), wall(RIGHT)]).nearest(MIDDLE)
     # The pictures of both views overlap in 28 columns of depth 4, in the middle of this view.
-    assert (
     torch.testing.assert_close(nearest[:, 10:38], torch.full((SIZE, 28), WALL, dtype=torch.float64))
     assert not nearest[:, :9].any()
     assert not nearest[:, 39:].any()
-    )
 
 
 def test_one_view_confirms_nothing():

@@ -324,7 +324,7 @@ def examine(
                 depth_map_of_rendering(view.camera, result.depth, result.alpha, center, reach).on_grid()
             )
             advance(len(by_view))
-    cameras = {view.name: view.camera for view in views} | evidence.held_out
+    cameras = {**{view.name: view.camera for view in views}, **evidence.held_out}
     for name, psnr in _neighbor_psnr(views, {name: facts.psnr for name, facts in by_view.items()}).items():
         by_view[name] = dataclasses.replace(by_view[name], beside=psnr)
     unseen = None
