@@ -243,7 +243,7 @@ def _stages(count: int, densified: int) -> tuple[Stage, ...]:
     stages = [Stage("plain", 1 / count, reflection=False, densify=True)]
     for number in range(1, count):
         weights = SurfelWeights(
-            polarization=1.0,
+            polarization=5.0,
             opacity=0.01,
             curvature=0.005,
             flatness=0.1,
