@@ -18,7 +18,7 @@ from polarguide_bench.options import BENCH, Bench, BenchOptions
 from polarguide_bench.recipes import recipe_named
 from polarguide_bench.results import Results
 from polarguide_synth.folder import State, folder_state, scene_digest, scene_request, verify_scene
-from polarguide_synth.render import Plan, expected_time, synthesize
+from polarguide_synth.render import Plan, report_expected_time, synthesize
 from polarguide_synth.schema import SceneSpec
 from polarguide_synth.settings import Overrides, find_scene
 
@@ -64,7 +64,7 @@ def run_bench(
     states = {name: _state(places[name], spec, bench) for name, spec in specs.items()}
     threads = options.jobs * options.threads
     plans = [Plan(spec, bench.synth, places[name]) for name, spec in specs.items()]
-    expected_time(plans, reporter, threads=threads)  # reports a missing Mitsuba
+    report_expected_time(plans, reporter, threads=threads)  # reports a missing Mitsuba
     make_folder(scenes)
     with locked(scenes):
         for name, spec in specs.items():

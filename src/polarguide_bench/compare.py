@@ -17,13 +17,11 @@ from polarguide import __version__
 from polarguide.capture import Scene
 from polarguide.capture.layout import refuse_scene
 from polarguide.capture.scene import IN_MEMORY
-from polarguide.capture.variants import EVERY
 from polarguide.core.errors import require
 from polarguide.core.files import check_out, make_folder, require_inside, write_text
 from polarguide.core.options import (
     MOST,
     ComputeOptions,
-    Exposures,
     PathLike,
     SceneOptions,
     check_choice,
@@ -54,7 +52,7 @@ from polarguide_bench.plan import (
     scene_entries,
 )
 from polarguide_bench.recipes import ABLATIONS, AnyRecipe, ablations_of
-from polarguide_bench.report import exposure_svg, read_study, study_svg, write_report
+from polarguide_bench.report import write_report
 from polarguide_bench.results import (
     FORMAT,
     REMEDY,
@@ -88,8 +86,7 @@ def compare(
 
     Writes tables (``results.json``, ``.md``, ``.csv`` and ``.tex``), figures (``results.pdf`` and ``.svg``) and
     ``report.html`` to ``out``, and the runs to its ``runs/``. If there are paired differences, they are written to
-    ``differences.csv``. If there are scores by object and material, they are written to ``parts.csv``. With
-    ``options.exposures``, ``exposures.svg`` shows the scores over the number of pictures.
+    ``differences.csv``. If there are scores by object and material, they are written to ``parts.csv``.
 
     Finished runs are not repeated. After a KeyboardInterrupt active runs save their states, and the same call resumes.
 
@@ -152,7 +149,7 @@ def compare(
         results = collect(comparison, entries, plan, failures)
         write_tables(comparison.out, results)
         write_report(comparison, entries, plan, results, reporter)
-        _write_charts(comparison, entries, results)
+        write_figures(comparison.out, results)
     return results
 
 
@@ -485,34 +482,3 @@ def _run_record(comparison: Comparison, run: PlannedRun, failure: str | None) ->
         },
         **parts,
     )
-
-
-def _write_charts(comparison: Comparison, scenes: Sequence[SceneEntry], results: Results) -> None:
-    """Write the figures, and charts of a family of scenes and of several kinds of captures."""
-    drawn = {"study.svg": study_svg(results, {scene.name: read_study(scene.path) for scene in scenes})}
-    if len(comparison.options.exposures) > 1:
-        counts = {
-            (scene.name, row.name): count_of(row.exposures, scene.views - len(scene.test_views))
-            for scene in scenes
-            for row in comparison.rows
-        }
-        drawn["exposures.svg"] = exposure_svg(results, counts)
-    for name, text in drawn.items():
-        if text is not None:
-            write_text(comparison.out / name, text)
-    write_figures(comparison.out, results)
-
-
-def count_of(exposures: Exposures, views: int) -> int:
-    """Return how many pictures ``select_exposures`` keeps from ``views`` training views with four pictures each."""
-    fourth = -(-views // EVERY)
-    counts = {
-        "three": 3 * views,
-        "two": 2 * views,
-        "one": views,
-        "unknown": views,
-        "none": views,
-        "mixed": views + 3 * fourth,
-        "sparse": 4 * fourth,
-    }
-    return counts.get(exposures, 4 * views)

@@ -1,18 +1,23 @@
-"""Figures of a comparison for publications, as PDF and SVG: the scores of all runs by recipe."""
+"""Figures of a comparison: scores by recipe for publications, and training curves for the report."""
 
 from __future__ import annotations
 
+import base64
 import io
+from collections.abc import Mapping
 from pathlib import Path
 from statistics import fmean
 from typing import Any
 
 import matplotlib as mpl
+import numpy as np
+import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from polarguide.core.files import write_whole
 from polarguide.results.evaluation.table import COLUMNS, Metric
+from polarguide.runs.folder import RunLog
 from polarguide_bench.results import Results
 
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")
@@ -25,8 +30,18 @@ HEIGHT_INCHES = 2.0
 """Height of a row of panels without the names of the recipes."""
 SPREAD = 0.6
 """Share of a recipe's place over which the points of the scenes are spread."""
-STYLE: Any = {"font.size": 7, "pdf.fonttype": 42, "svg.fonttype": "none", "svg.hashsalt": "polarguide"}
+STYLE: Any = {
+    "font.size": 7,
+    "pdf.fonttype": 42,
+    "svg.fonttype": "none",
+    "svg.hashsalt": "polarguide",
+    "text.parse_math": False,
+}
 """Small fonts, text that stays text, and the same file for the same results."""
+POINTS = 240
+"""Approximate number of points of a curve."""
+SMOOTHED_SHARE = 0.05
+"""Width of the running mean of a curve, as a share of the training. Single steps are noisy, because views differ."""
 
 
 def write_figures(out: Path, results: Results) -> None:
@@ -48,9 +63,14 @@ def write_figures(out: Path, results: Results) -> None:
     with mpl.rc_context(STYLE):
         figure = draw_scores(results, metrics)
         for kind, path in files.items():
-            data = io.BytesIO()
-            figure.savefig(data, format=kind, metadata={"CreationDate" if kind == "pdf" else "Date": None})
-            write_whole(path, data.getvalue())
+            write_whole(path, _encoded(figure, kind))
+
+
+def _encoded(figure: Figure, kind: str) -> bytes:
+    """Return a figure as a PDF or SVG file without a date."""
+    data = io.BytesIO()
+    figure.savefig(data, format=kind, metadata={"CreationDate" if kind == "pdf" else "Date": None})
+    return data.getvalue()
 
 
 def draw_scores(results: Results, metrics: list[Metric]) -> Figure:
@@ -97,3 +117,45 @@ def _draw_panel(axes: Axes, results: Results, metric: Metric) -> None:
     axes.set_title(metric.heading, fontsize=8)
     axes.spines[["top", "right"]].set_visible(False)
     axes.grid(axis="y", linewidth=0.3)
+
+
+def read_curve(run: Path) -> pd.DataFrame:
+    """Read the training curve of a run from its log.
+
+    Returns:
+        About ``POINTS`` rows with the columns ``step``, ``seconds``, ``psnr`` (running mean over the training views,
+        in dB) and ``held_out`` (mean PSNR of a few held-out views, or NaN).
+    """
+    log = pd.DataFrame(RunLog(run).rows(), columns=["step", "seconds", "psnr", "held_out"]).astype(float)
+    log = log.dropna(subset=["psnr"])
+    window = 2 * int(len(log) * SMOOTHED_SHARE / 2) + 1
+    log["psnr"] = log["psnr"].rolling(window, center=True, min_periods=1).mean()
+    log["step"] += 1
+    every = max(1, len(log) // POINTS)
+    return log[(np.arange(len(log)) % every == 0) | log["held_out"].notna()]
+
+
+def training_curves(curves: Mapping[str, pd.DataFrame]) -> str:
+    """Draw the PSNR of trainings over steps and over seconds.
+
+    Args:
+        curves: result of ``read_curve`` for each recipe. Lines are training views, dots are held-out views.
+
+    Returns:
+        An SVG file as a data URI.
+    """
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(WIDTH_INCHES, 1.3 * HEIGHT_INCHES), layout="constrained")
+        panels = figure.subplots(1, 2, sharey=True)
+        for axes, column, label in zip(panels, ("step", "seconds"), ("steps", "seconds"), strict=True):
+            for number, (recipe, curve) in enumerate(curves.items()):
+                color = f"C{number}"
+                axes.plot(curve[column], curve["psnr"], color=color, linewidth=1, label=recipe)
+                axes.plot(curve[column], curve["held_out"], "o", color=color, markersize=3)
+            axes.set_xlabel(label)
+            axes.spines[["top", "right"]].set_visible(False)
+            axes.grid(linewidth=0.3)
+        panels[0].set_ylabel("PSNR (dB)")
+        handles, labels = panels[0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False)
+        return f"data:image/svg+xml;base64,{base64.b64encode(_encoded(figure, 'svg')).decode()}"

@@ -30,7 +30,7 @@ from polarguide.methods.registry import (
     without,
 )
 from polarguide.training.recipe import Recipe, Weights
-from polarguide_bench.gnerp.recipe import FieldRates, FieldShape, NeuralRecipe, Sampling
+from polarguide_bench.gnerp.recipe import NeuralRecipe
 from polarguide_bench.polgs import RECIPE_POLGS
 
 AnyRecipe = Recipe | NeuralRecipe
@@ -281,15 +281,6 @@ ABLATIONS_GNERP = (
         name="gnerp:circular",
         about="gnerp with angles compared on the circle.",
         weights=replace(RECIPE_GNERP.weights, circular=True),
-    ),
-    replace(
-        RECIPE_GNERP,
-        name="gnerp:published",
-        about="gnerp with the published networks, samples and steps: for a GPU.",
-        steps=100_000,
-        shape=FieldShape(kind="networks"),
-        sampling=Sampling(coarse=64, fine=128),
-        rates=FieldRates(networks=5e-4),
     ),
 )
 

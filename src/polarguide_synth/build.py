@@ -34,7 +34,7 @@ from polarguide_synth.schema import (
     require_solid,
     require_unicode,
 )
-from polarguide_synth.settings import Variant, mi
+from polarguide_synth.settings import mi
 from polarguide_synth.textures import fractal_noise, make_environment, make_texture
 from polarguide_synth.transport import VISIBLE
 
@@ -238,17 +238,17 @@ def make_mesh(shape: dict[str, Any], where: str) -> Mesh:
     return make(SHAPES, shape, f"{where} shape", f"a type of {', '.join([*SHAPES, 'mesh'])}")
 
 
-def bsdf_dict(material: Material, texture: Array | None, channel: int | None) -> dict[str, Any]:
+def bsdf_dict(material: Material, texture: Array | None, channel: int) -> dict[str, Any]:
     """Return Mitsuba's dictionary for the BSDF of a material.
 
     Args:
         material: the material.
         texture: base color [H, W, 3]. If None, the color of the material is used.
-        channel: 0 to 2 for red, green or blue. If None, the BSDF is for all wavelengths.
+        channel: 0 to 2 for red, green or blue.
     """
     base = _value(material.color, channel) if texture is None else _bitmap(texture, channel)
     if material.type == "metal":
-        index = {name: _metal(getattr(material, name), channel) for name in ("eta", "k")}
+        index = {name: _value(getattr(material, name), channel) for name in ("eta", "k")}
         inner = {"type": "roughconductor", "distribution": "ggx", "alpha": material.roughness, **index}
     elif material.type == "matte":
         inner = {"type": "diffuse", "reflectance": base}
@@ -258,37 +258,25 @@ def bsdf_dict(material: Material, texture: Array | None, channel: int | None) ->
     return {"type": "twosided", "inner": inner}
 
 
-def _value(color: Any, channel: int | None) -> dict[str, Any]:
-    """Return Mitsuba's dictionary for a reflectance or radiance."""
-    if channel is None:
-        return {"type": "rgb", "value": [float(c) for c in color]}
+def _value(color: Any, channel: int) -> dict[str, Any]:
+    """Return Mitsuba's dictionary for a reflectance, a radiance or an index of refraction."""
     return {"type": "uniform", "value": float(color[channel])}
 
 
-def _metal(index: tuple[float, float, float], channel: int | None) -> dict[str, Any]:
-    """Return Mitsuba's dictionary for a spectrum with given values at red, green and blue."""
-    if channel is not None:
-        return _value(index, channel)
-    red, green, blue = index
-    values = f"{blue}, {blue}, {green}, {red}, {red}"
-    return {"type": "irregular", "wavelengths": "360, 450, 545, 620, 830", "values": values}
-
-
-def _bitmap(texture: Array, channel: int | None) -> dict[str, Any]:
+def _bitmap(texture: Array, channel: int) -> dict[str, Any]:
     """Return Mitsuba's dictionary for a texture [H, W, 3].
 
     A texture of one row is a palette, whose colors are not interpolated.
     """
-    part = texture if channel is None else texture[..., channel : channel + 1]
     # Rows of a picture go down, v goes up.
-    bitmap = mi.Bitmap(np.ascontiguousarray(part[::-1], np.float32))
+    bitmap = mi.Bitmap(np.ascontiguousarray(texture[::-1, :, channel : channel + 1], np.float32))
     blend = "nearest" if len(texture) == 1 else "bilinear"
-    return {"type": "bitmap", "bitmap": bitmap, "raw": channel is not None, "filter_type": blend}
+    return {"type": "bitmap", "bitmap": bitmap, "raw": True, "filter_type": blend}
 
 
-def environment_dict(panorama: Array, channel: int | None) -> dict[str, Any]:
+def environment_dict(panorama: Array, channel: int) -> dict[str, Any]:
     """Return Mitsuba's dictionary for an environment light with a panorama [H, W, 3]."""
-    part = panorama if channel is None else np.repeat(panorama[..., channel : channel + 1], 3, -1)
+    part = np.repeat(panorama[..., channel : channel + 1], 3, -1)
     # The left edge of Mitsuba's panoramas is its -z; y is up and columns proceed to the right.
     axes = np.array([[0, 0, -1, 0], [-1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1]], float)
     return {"type": "envmap", "bitmap": mi.Bitmap(np.ascontiguousarray(part, np.float32)),
@@ -300,7 +288,7 @@ def visibility_dict(spec: SceneSpec, visible: bool) -> dict[str, Any]:
     return {VISIBLE: _value((float(visible),), 0)} if spec.object_only else {}
 
 
-def area_light_dict(light: dict[str, Any], channel: int | None, where: str) -> dict[str, Any]:
+def area_light_dict(light: dict[str, Any], channel: int, where: str) -> dict[str, Any]:
     """Return Mitsuba's dictionary for a rectangular area light.
 
     Args:
@@ -335,7 +323,7 @@ class BuiltScene:
 
     Attributes:
         spec: the scene data.
-        scenes: one or three scenes of Mitsuba (see ``sensor.render_lobes``).
+        scenes: scenes of Mitsuba for red, green and blue.
         shapes: Mitsuba's shapes of the objects in the first scene, in the order of the data.
         textures: texture of each object, [H, W, 3] with rows from the top down. None for an object of one color.
     """
@@ -351,7 +339,7 @@ class BuiltScene:
         return np.array([False, *self.spec.visible])
 
 
-def build_scene(spec: SceneSpec, folder: Path, variant: Variant) -> BuiltScene:
+def build_scene(spec: SceneSpec, folder: Path) -> BuiltScene:
     """Generate the meshes, textures and environment of a scene, write them to files, and load them into Mitsuba.
 
     The files are ``mesh/<thing>.ply`` and ``environment.hdr``.
@@ -359,7 +347,6 @@ def build_scene(spec: SceneSpec, folder: Path, variant: Variant) -> BuiltScene:
     Args:
         spec: the scene data.
         folder: folder to write.
-        variant: the current variant of Mitsuba.
 
     Raises:
         PolarguideError: a shape, a texture, a light or the environment is invalid.
@@ -374,7 +361,7 @@ def build_scene(spec: SceneSpec, folder: Path, variant: Variant) -> BuiltScene:
     write_whole(folder / "environment.hdr", encoded.tobytes())
     textures = [_texture(thing, mesh, spec.folder) for thing, mesh in zip(spec.things, meshes, strict=True)]
     contents: list[dict[str, Any]] = []
-    for channel in range(3) if variant.color == "rgb" else (None,):
+    for channel in range(3):
         content: dict[str, Any] = {"type": "scene", "sky": environment_dict(panorama, channel)}
         for number, thing in enumerate(spec.things):
             place = folder / "mesh" / f"{thing.name}.ply"

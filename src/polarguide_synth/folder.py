@@ -25,7 +25,7 @@ from polarguide.geometry.polarizer import ANGLES, malus
 from polarguide.optics.color import srgb_encode_array
 from polarguide_synth.mesh import Array
 from polarguide_synth.schema import SceneSpec, with_current_keys
-from polarguide_synth.settings import SynthSettings, Variant
+from polarguide_synth.settings import VARIANT, SynthSettings
 
 State = Literal["new", "begun", "finished"]
 REQUEST = "request.json"
@@ -198,7 +198,6 @@ CONVENTION = {
 def scene_record(
     spec: SceneSpec,
     settings: SynthSettings,
-    variant: Variant,
     names: list[str],
     tests: list[str],
     *,
@@ -210,7 +209,6 @@ def scene_record(
     Args:
         spec: the scene.
         settings: settings of the rendering.
-        variant: variant of Mitsuba.
         names: names of the views.
         tests: names of the held-out views.
         exposure: factor from radiance to the values of the pictures.
@@ -243,7 +241,7 @@ def scene_record(
         "seed": settings.seed,
         "renderer": {
             "mitsuba": importlib.metadata.version("mitsuba"),
-            "variant": variant.name,
+            "variant": VARIANT,
             "polarguide": __version__,
         },
         "settings": settings.data(),

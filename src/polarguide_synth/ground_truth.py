@@ -42,30 +42,17 @@ class Intersections:
 
 def intersect(built: BuiltScene, origins: Array, toward: Array) -> Intersections:
     """Intersect rays with origins [N, 3] and unit directions [N, 3] with the scene."""
-    if mi.variant().startswith("scalar"):
-        pairs = zip(origins.tolist(), toward.tolist(), strict=True)
-        rows = [_intersect(built, mi.Point3f(*o), mi.Vector3f(*d)) for o, d in pairs]
-        columns = [np.array(column, float) for column in zip(*rows, strict=True)]
-    else:
-        origin = mi.Point3f(np.ascontiguousarray(origins.T, np.float32))
-        direction = mi.Vector3f(np.ascontiguousarray(toward.T, np.float32))
-        columns = [np.array(value, float).T for value in _intersect(built, origin, direction)]
-    distance, normal, thing, uv = columns
-    hit = thing > 0
-    normal = np.where((normal * toward).sum(-1, keepdims=True) > 0, -normal, normal) * hit[:, None]
-    return Intersections(distance * hit, normal, thing.astype(np.uint8), uv)
-
-
-def _intersect(built: BuiltScene, origin: Any, direction: Any) -> tuple[Any, Any, Any, Any]:
-    """Return distance, normal, number of the object, and texture coordinates, as types of Mitsuba."""
+    origin = mi.Point3f(np.ascontiguousarray(origins.T, np.float32))
+    direction = mi.Vector3f(np.ascontiguousarray(toward.T, np.float32))
     si = built.scenes[0].ray_intersect(mi.Ray3f(origin, direction))
-    if mi.variant().startswith("scalar"):
-        number = next((k + 1 for k, shape in enumerate(built.shapes) if shape == si.shape), 0)
-        return (si.t if number else 0.0), list(si.sh_frame.n), number, list(si.uv)
     number = mi.UInt32(0)
     for k, shape in enumerate(built.shapes):
         number = dr.select(si.shape == mi.ShapePtr(shape), k + 1, number)
-    return dr.select(si.is_valid(), si.t, 0.0), si.sh_frame.n, number, si.uv
+    values = (dr.select(si.is_valid(), si.t, 0.0), si.sh_frame.n, number, si.uv)
+    distance, normal, thing, uv = (np.array(value, float).T for value in values)
+    hit = thing > 0
+    normal = np.where((normal * toward).sum(-1, keepdims=True) > 0, -normal, normal) * hit[:, None]
+    return Intersections(distance * hit, normal, thing.astype(np.uint8), uv)
 
 
 def ground_truth_maps(built: BuiltScene, camera: Camera) -> dict[str, NDArray[Any]]:

@@ -1,10 +1,9 @@
-"""Render scene folders with ground truth, for one scene or for a series of values of a parameter."""
+"""Render scene folders with ground truth."""
 
 from __future__ import annotations
 
 import io
 import json
-import math
 import os
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
@@ -17,9 +16,7 @@ import torch
 
 from polarguide.capture.sensor.pattern import SENSORS
 from polarguide.capture.write import write_png_file, write_view
-from polarguide.core.errors import require
 from polarguide.core.progress import Reporter
-from polarguide.core.text import decimals
 from polarguide.geometry.camera import Camera
 from polarguide_synth import folder
 from polarguide_synth.build import BuiltScene, build_scene
@@ -39,7 +36,7 @@ from polarguide_synth.sensor import (
     plan_shot,
     render_lobes,
 )
-from polarguide_synth.settings import LONG_SECONDS, Overrides, SynthSettings, choose_variant, rough_time
+from polarguide_synth.settings import LONG_SECONDS, PATHS_PER_SECOND, SynthSettings, rough_time, start_mitsuba
 from polarguide_synth.transport import PathLimits
 
 TEST_SAMPLES = 4
@@ -147,29 +144,26 @@ class Job(Plan):
     sensor: Sensor
 
 
-def expected_time(plans: Sequence[Plan], reporter: Reporter, *, threads: int = 0) -> float:
-    """Estimate the time in seconds to render the unfinished views of scenes. Nothing is written.
+def report_expected_time(plans: Sequence[Plan], reporter: Reporter, *, threads: int = 0) -> None:
+    """Report how long the unfinished views of scenes take, if this is more than an hour. Nothing is written.
 
     Args:
         plans: the scenes.
-        reporter: receiver of the estimate if it is long, and of a warning if only Mitsuba's slow variant is available.
+        reporter: receiver of the estimate.
         threads: number of threads; 0 uses all cores.
 
     Raises:
         PolarguideError: for the same reasons as in ``synthesize``.
     """
     unfinished = [plan for plan in plans if plan.checked_state() != "finished"]
-    if not unfinished:
-        return 0.0
-    variant = choose_variant(unfinished[0].settings.color, threads=threads)
-    seconds = sum(plan.paths_left() for plan in unfinished) / variant.paths_per_second
-    if variant.note:
-        reporter.warn(variant.note)
-    if variant.note or seconds > LONG_SECONDS:
+    if unfinished:
+        start_mitsuba(threads=threads)
+    paths_per_second = PATHS_PER_SECOND * (threads or os.cpu_count() or 1)
+    seconds = sum(plan.paths_left() for plan in unfinished) / paths_per_second
+    if seconds > LONG_SECONDS:
         reporter.say(
             f"Rendering will take {rough_time(seconds)}. Repeat the command to resume a stopped rendering."
         )
-    return seconds
 
 
 def synthesize(
@@ -196,12 +190,12 @@ def synthesize(
         verify_scene(out)
         reporter.say(f"{out} is finished. The checksums of all files match.")
         return out
-    variant = choose_variant(settings.color, threads=threads)
+    start_mitsuba(threads=threads)
     if state == "new":
         request = folder.scene_request(spec, settings)
         folder.write_file(out / folder.REQUEST, json.dumps(request, indent=1).encode())
     names = plan.names
-    built = build_scene(spec, out, variant)
+    built = build_scene(spec, out)
     cameras = place_cameras(spec.camera, settings.width, settings.height, settings.seed)
     exposure = spec.exposure or _metered_exposure(built, cameras, settings.seed)
     job = Job(spec, settings, out, built, cameras, exposure, Sensor())
@@ -210,7 +204,6 @@ def synthesize(
     record = scene_record(
         spec,
         settings,
-        variant,
         names,
         plan.tests,
         exposure=exposure,
@@ -321,150 +314,3 @@ def _halved(values: Array) -> Array:
     """Average blocks of 2x2 pixels: an array [..., 2H, 2W, 3] becomes [..., H, W, 3]."""
     *lead, height, width, colors = values.shape
     return np.asarray(values.reshape(*lead, height // 2, 2, width // 2, 2, colors).mean(axis=(-4, -2)))
-
-
-PARAMETERS = ("views", "noise", "roughness", "index", "spacing")
-"""Parameters that a sweep can vary."""
-
-
-@dataclass(frozen=True)
-class Sweep:
-    """A parameter that is varied between scenes, and its values in ascending order."""
-
-    parameter: str
-    values: tuple[float, ...]
-
-
-def parse_sweep(text: str) -> Sweep:
-    """Parse a parameter and its values, such as ``noise=0,1,2``.
-
-    Raises:
-        PolarguideError: the parameter is unknown, or a value is invalid.
-    """
-    parameter, _, listed = text.partition("=")
-    values = tuple(sorted(set(decimals(listed))))
-    valid = all(math.isfinite(v) and (parameter != "views" or (v.is_integer() and v >= 2)) for v in values)
-    require(
-        parameter in PARAMETERS and values and valid,
-        "--sweep",
-        expected=f"one of {', '.join(PARAMETERS)} with values, such as noise=0,1,2 or views=9,18,36",
-        found=repr(text),
-        remedy="docs/reference/scene-files.md has examples.",
-    )
-    return Sweep(parameter, values)
-
-
-def sweep_scenes(
-    spec: SceneSpec, out: Path, settings: SynthSettings, overrides: Overrides, sweep: Sweep, reporter: Reporter, *,
-    threads: int = 0,
-) -> list[Path]:  # fmt: skip
-    """Render one scene for each value of a parameter, into folders such as ``views-06`` and ``views-12``.
-
-    The parameter ``views`` is the number of training views. For this parameter, the scene is rendered only once, and
-    smaller scenes leave out training views evenly. All scenes share their held-out views and the files of their
-    pictures.
-
-    Args:
-        spec: the scene.
-        out: folder that contains the folders of the scenes.
-        settings: settings of the rendering.
-        overrides: changes to the scene.
-        sweep: the parameter and its values.
-        reporter: receiver of progress and messages.
-        threads: number of threads; 0 uses all cores.
-
-    Returns:
-        The folders of the scenes, in the order of the values.
-
-    Raises:
-        PolarguideError: for the same reasons as in ``synthesize``, or because the scene has too few views.
-    """
-    plans = sweep_plans(spec, out, settings, overrides, sweep)
-    if sweep.parameter == "views":
-        return _fewer_views(plans[0], out, sweep, reporter, threads)
-    for value, plan in zip(sweep.values, plans, strict=True):
-        synthesize(plan.spec, plan.out, plan.settings, reporter, threads=threads)
-        record = json.loads((plan.out / "scene.json").read_text(encoding="utf-8"))
-        _write_record(plan.out, record, sweep.parameter, value)
-    return [plan.out for plan in plans]
-
-
-def sweep_plans(
-    spec: SceneSpec, out: Path, settings: SynthSettings, overrides: Overrides, sweep: Sweep
-) -> list[Plan]:
-    """Return one plan for each value of a sweep, in their order.
-
-    For the parameter ``views``, return a single plan that contains all views.
-    """
-    if sweep.parameter == "views":
-        return [Plan(overrides.apply(spec), settings, out / "all")]
-    plans = []
-    for value in sweep.values:
-        change: dict[str, Any] = {sweep.parameter: value}
-        noise = sweep.parameter == "noise"
-        changed = (overrides if noise else replace(overrides, **change)).apply(spec)
-        plans.append(
-            Plan(changed, replace(settings, **change) if noise else settings, _member(out, sweep, value))
-        )
-    return plans
-
-
-def _member(out: Path, sweep: Sweep, value: float) -> Path:
-    """Return the folder of a value, such as views-06. Leading zeros make the names sortable."""
-    digits = max(len(str(int(other))) for other in sweep.values)
-    whole, *rest = f"{value:g}".split(".")
-    return out / f"{sweep.parameter}-{'.'.join([whole.zfill(digits), *rest])}"
-
-
-def _write_record(scene: Path, record: dict[str, Any], parameter: str, value: float) -> None:
-    """Write ``scene.json`` with the parameter and the value of a sweep."""
-    record = {**record, "study": {"parameter": parameter, "value": value}}
-    folder.write_file(scene / "scene.json", json.dumps(record, indent=1).encode())
-
-
-def _fewer_views(plan: Plan, out: Path, sweep: Sweep, reporter: Reporter, threads: int) -> list[Path]:
-    """Write the scenes of a sweep over the number of training views, from the scene with all views."""
-    spec = plan.spec
-    settings = plan.settings
-    cameras = place_cameras(spec.camera, settings.width, settings.height, settings.seed)
-    by_name = dict(zip(plan.names, cameras, strict=True))
-    train = [name for name in plan.names if name not in plan.tests]
-    require(
-        sweep.values[-1] <= len(train),
-        "--sweep",
-        expected=f"up to {len(train)} training views",
-        found=f"{sweep.values[-1]:g}",
-        remedy=f"The scene has {len(cameras)} views; give --views to render more.",
-    )
-    synthesize(spec, plan.out, settings, reporter, threads=threads)
-    record = json.loads((plan.out / "scene.json").read_text(encoding="utf-8"))
-    folders = []
-    for value in sweep.values:
-        member = _member(out, sweep, value)
-        folders.append(member)
-        if (member / "scene.json").exists():
-            verify_scene(member)
-            continue
-        chosen = [train[k] for k in np.unique(np.linspace(0, len(train) - 1, int(value)).round().astype(int))]
-        names = sorted([*chosen, *plan.tests])
-        _link(plan.out, member, names)
-        built = build_scene(spec, member, choose_variant(settings.color, threads=threads))
-        write_sparse(built, [by_name[name] for name in names], names, plan.tests, member, settings)
-        smaller = {**record, "views": names, "train": chosen, "sha256": write_manifest(member)}
-        _write_record(member, smaller, "views", value)
-        reporter.say(f"{member}: {len(chosen)} training views")
-    return folders
-
-
-def _link(scene: Path, member: Path, names: list[str]) -> None:
-    """Share the files of some views between two scenes, by hard links if the disk supports them."""
-    for name in names:
-        raw = (scene / "raw").glob(f"{name}[._]*")
-        for source in (*folder.view_files(scene, name, ground_truth=True), *raw):
-            target = member / source.relative_to(scene)
-            if source.exists() and not target.exists():
-                target.parent.mkdir(parents=True, exist_ok=True)
-                try:
-                    os.link(source, target)
-                except OSError:
-                    folder.write_file(target, source.read_bytes())

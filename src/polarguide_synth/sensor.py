@@ -28,7 +28,6 @@ from polarguide_synth.transport import (
     PathLimits,
     Sampler,
     lens_stokes,
-    opaque_value,
     pinhole,
     primary_rays,
     trace_paths,
@@ -254,8 +253,7 @@ def render_lobes(
     """Render the radiance of a view, separated by the lobes of the first surface.
 
     Args:
-        scenes: one Mitsuba scene of a spectral variant, or three of a mono variant for red, green and blue. The three
-            channels share their random numbers, so the noise has no color.
+        scenes: Mitsuba scenes for red, green and blue. They share their random numbers, so the noise has no color.
         camera: pose and intrinsics. The reconstruction filter is a box of one pixel.
         samples: paths per pixel and lobe.
         seed: seed of the view.
@@ -270,11 +268,7 @@ def render_lobes(
     total = np.zeros((pixels, 7, 3))
     for start in range(0, samples, batch):
         for channel, scene in enumerate(scenes):
-            sums = _render_pass(scene, camera, (start, batch), seed, limits, center)
-            if len(scenes) == 1:
-                total += sums
-            else:
-                total[..., channel] += sums[..., 0]
+            total[..., channel] += _render_pass(scene, camera, (start, batch), seed, limits, center)
     grid = (total / samples).reshape(camera.height, camera.width, 7, 3).transpose(2, 0, 1, 3)
     return LobeRadiance(grid[0:3], grid[3:6], grid[6])
 
@@ -282,24 +276,17 @@ def render_lobes(
 def _render_pass(
     scene: Any, camera: Camera, part: tuple[int, int], seed: int, limits: PathLimits, center: bool
 ) -> NDArray[np.float64]:
-    """Sum the samples of each pixel, [pixels, 7, 3 or 1].
+    """Sum the samples of each pixel, [pixels, 7].
 
     ``part`` contains the number of the first sample, and the number of samples.
     """
     pixels = camera.width * camera.height
     first, count = part
     lens = pinhole(camera)
-    start = opaque_value(mi.UInt32, seed * SCATTER % 2**32)
-    if mi.variant().startswith("scalar"):
-        sums = np.zeros((pixels, 7, 3))
-        for pixel in range(pixels):
-            for sample in range(first, first + count):
-                parts = _path(scene, lens, pixel, sample, start, limits, center)
-                sums[pixel] += np.array([[float(v) for v in color] for color in parts])
-        return sums
-    part_values = [opaque_value(mi.UInt32, value) for value in (first, count)]
+    start = dr.opaque(mi.UInt32, seed * SCATTER % 2**32)
+    part_values = [dr.opaque(mi.UInt32, value) for value in (first, count)]
     totals = _compiled()(scene, lens, part_values, pixels, count, start, limits, center)
-    return np.stack([column.numpy() for column in totals], -1).reshape(pixels, 7, -1).astype(np.float64)
+    return np.stack([column.numpy() for column in totals], -1).astype(np.float64)
 
 
 @functools.cache
@@ -326,37 +313,25 @@ def _sums(
     index = dr.arange(mi.UInt32, pixels * count)
     pixel = index // per_pixel
     sample = index - pixel * per_pixel + first
-    flat = [value for color in _path(scene, lens, pixel, sample, seed, limits, center) for value in color]
-    dr.eval(flat)
-    return [dr.block_reduce(dr.ReduceOp.Add, value, count) for value in flat]
+    parts = _path(scene, lens, pixel, sample, seed, limits, center)
+    dr.eval(parts)
+    return [dr.block_reduce(dr.ReduceOp.Add, part, count) for part in parts]
 
 
 def _path(
     scene: Any, lens: list[Any], pixel: Any, sample: Any, seed: Any, limits: PathLimits, center: bool
-) -> list[list[Any]]:
-    """Trace one sample of a pixel in color.
+) -> list[Any]:
+    """Trace one sample of a pixel.
 
     Returns:
         S0, S1 and S2 of the specular lobe and of the diffuse lobe; and directly visible emission.
     """
     sampler = Sampler(mi.UInt32(pixel), mi.UInt32(sample), seed)
-    spread = sampler.next()
+    sampler.next()  # earlier versions sampled a wavelength with the first number
     place = sampler.pair()
     if center:
         place = mi.Point2f(0.5, 0.5)
     ray, x_ref = primary_rays(lens, mi.UInt32(pixel), place)
-    weight: Any = 1.0
-    if mi.is_spectral:
-        ray.wavelengths, weight = mi.sample_rgb_spectrum(_shifted(spread))
     specular, diffuse, emitted = trace_paths(scene, ray, sampler, limits)
     parts = [*lens_stokes(specular, ray, x_ref), *lens_stokes(diffuse, ray, x_ref), emitted]
-    if not mi.is_spectral:
-        return [[part.x] for part in parts]
-    colors = [mi.spectrum_to_srgb(part * weight, ray.wavelengths, True) for part in parts]
-    return [[color.x, color.y, color.z] for color in colors]
-
-
-def _shifted(sample: Any) -> Any:
-    """Return four equally spaced numbers modulo 1, from which the wavelengths of a ray are sampled."""
-    values = (sample + k / 4 for k in range(4))
-    return mi.UnpolarizedSpectrum(*(dr.select(value >= 1.0, value - 1.0, value) for value in values))
+    return [part.x for part in parts]

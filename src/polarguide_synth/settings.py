@@ -1,4 +1,4 @@
-"""Settings of a rendering, changes to a scene, and the choice of Mitsuba's variant."""
+"""Settings of a rendering, changes to a scene, and the start of Mitsuba."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import contextlib
 import os
 import sys
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -20,15 +20,14 @@ from polarguide.core.records import check_options
 from polarguide.core.text import decimals
 from polarguide_synth.schema import SceneSpec, parse_scene, read_scene_file
 
-Color = Literal["rgb", "spectral"]
+VARIANT = "llvm_ad_mono_polarized"
+"""Variant of Mitsuba that renders the three channels one after the other, with exact values."""
 OLDEST_LLVM = 16
 """Oldest supported version of LLVM. Earlier versions crash on newer processors."""
-SLOW_PATHS_PER_SECOND = 800.0
-"""Approximate number of paths per second of the scalar variant, which uses one thread."""
-FAST_PATHS_PER_SECOND = 200_000.0
-"""Approximate number of paths per second and thread of a compiled variant."""
+PATHS_PER_SECOND = 200_000.0
+"""Approximate number of paths per second and thread."""
 LONG_SECONDS = 3600.0
-"""Estimated duration of a rendering above which the user has to confirm it."""
+"""Estimated duration of a rendering above which the estimate is printed."""
 
 
 class _Library:
@@ -45,51 +44,27 @@ dr: Any = _Library("drjit")
 mi: Any = _Library("mitsuba")
 
 
-@dataclass(frozen=True)
-class Variant:
-    """The variant of Mitsuba in use, which determines speed and representation of color.
-
-    Attributes:
-        name: Mitsuba's name of the variant.
-        color: "rgb" renders three channels one after the other with exact values. "spectral" traces four wavelengths
-            per path and converts them.
-        paths_per_second: approximate speed on this machine.
-        note: reason why a slow variant is used. Empty for a fast variant.
-    """
-
-    name: str
-    color: Color
-    paths_per_second: float
-    note: str = ""
-
-
-def choose_variant(color: Color = "rgb", *, threads: int = 0) -> Variant:
-    """Select a variant of Mitsuba that supports polarization.
-
-    It is a compiled variant if the LLVM library can be loaded, else the scalar variant.
+def start_mitsuba(*, threads: int = 0) -> None:
+    """Load Mitsuba, and select the variant that supports polarization.
 
     Args:
-        color: representation of color. The scalar variant supports "spectral" only.
         threads: number of threads; 0 uses all cores.
 
     Raises:
-        PolarguideError: Mitsuba is not installed.
+        PolarguideError: Mitsuba or its compiler LLVM is not installed.
     """
     with _silent_stderr():
         mi.variant()  # the import prints messages
         missing = missing_llvm()
-        if missing:
-            mi.set_variant("scalar_spectral_polarized")
-    if missing:
-        note = (
-            f"Mitsuba's fast variants need LLVM {OLDEST_LLVM} or newer as a shared library ({missing}); on Debian "
-            "'apt-get install libllvm19', elsewhere set DRJIT_LIBLLVM_PATH. The slow scalar variant is used."
-        )
-        return Variant(mi.variant(), "spectral", SLOW_PATHS_PER_SECOND, note)
-    mi.set_variant("llvm_ad_mono_polarized" if color == "rgb" else "llvm_ad_spectral_polarized")
+    require(
+        not missing,
+        "synth",
+        expected=f"LLVM {OLDEST_LLVM} or newer as a shared library",
+        found=missing,
+        remedy="On Debian, run apt-get install libllvm19. Elsewhere, set DRJIT_LIBLLVM_PATH to the library.",
+    )
     if threads:
         dr.set_thread_count(threads)
-    return Variant(mi.variant(), color, FAST_PATHS_PER_SECOND * (threads or os.cpu_count() or 1))
 
 
 @contextlib.contextmanager
@@ -112,7 +87,7 @@ def missing_llvm() -> str:
     if path and not os.path.exists(path):  # otherwise the library prints messages
         return f"DRJIT_LIBLLVM_PATH names {path}, which does not exist"
     try:
-        mi.set_variant("llvm_ad_mono_polarized")
+        mi.set_variant(VARIANT)
         version = dr.detail.llvm_version()
     except (ImportError, RuntimeError):
         return "none was found"
@@ -149,7 +124,7 @@ class SynthSettings:
         noise: Photon and read noise. 1 simulates an exposure to full scale, 2 an exposure with a quarter of that light,
             0 no noise.
         exposures: Exposures of each mosaic or photograph in stops, such as 0,-3,-6. By default, one normal exposure.
-        color: Three channels with exact values, or a sampled spectrum.
+        color: Representation of color in records. Earlier versions could also sample a spectrum.
         ground_truth: Views for which ground truth is written.
         points: Approximate number of sparse points.
         test_every: Interval of held-out views.
@@ -164,7 +139,7 @@ class SynthSettings:
     ] = "ideal"
     noise: Annotated[float, Meta(ge=0, le=100)] = 0.0
     exposures: str | None = None
-    color: Color = "rgb"
+    color: Literal["rgb"] = field(default="rgb", init=False)
     ground_truth: Literal["test", "all"] = "test"
     points: Annotated[int, Meta(ge=0)] = 5000
     test_every: Annotated[int, Meta(ge=2)] = TEST_EVERY

@@ -19,22 +19,17 @@ from polarguide.geometry.camera import Camera
 from polarguide_synth.settings import dr, mi
 
 
-def opaque_value(kind: Any, value: float) -> Any:
-    """Convert a number to a type of Mitsuba without compiling it into the kernel. All views then share one kernel."""
-    return kind(value) if mi.variant().startswith("scalar") else dr.opaque(kind, value)
-
-
 def pinhole(camera: Camera) -> list[Any]:
     """Convert a camera to Mitsuba's types.
 
     Returns:
         Width of the picture; (fx, fy, cx, cy); axes of the camera in the world; and its center.
     """
-    inner = [opaque_value(mi.Float, value) for value in (camera.fx, camera.fy, camera.cx, camera.cy)]
+    inner = [dr.opaque(mi.Float, value) for value in (camera.fx, camera.fy, camera.cx, camera.cy)]
     # The rows of the world-to-camera rotation are the camera's axes in the world.
-    axes = [mi.Vector3f(*(opaque_value(mi.Float, float(v)) for v in row)) for row in camera.rotation]
-    origin = mi.Point3f(*(opaque_value(mi.Float, float(v)) for v in camera.center))
-    return [opaque_value(mi.UInt32, camera.width), inner, axes, origin]
+    axes = [mi.Vector3f(*(dr.opaque(mi.Float, float(v)) for v in row)) for row in camera.rotation]
+    origin = mi.Point3f(*(dr.opaque(mi.Float, float(v)) for v in camera.center))
+    return [dr.opaque(mi.UInt32, camera.width), inner, axes, origin]
 
 
 def primary_rays(camera: list[Any], pixel: Any, place: Any) -> tuple[Any, Any]:
@@ -190,8 +185,8 @@ def trace_paths(
     """Trace the light that arrives along rays, separately for the two lobes of the first surface.
 
     Args:
-        scene: Mitsuba scene, of a polarized variant.
-        ray: primary rays, with wavelengths in a spectral variant.
+        scene: Mitsuba scene.
+        ray: primary rays.
         sampler: random numbers of every ray.
         limits: limits of the paths.
 
@@ -202,7 +197,7 @@ def trace_paths(
     si = scene.ray_intersect(ray)
     visible = _visible(si) if limits.visible_only else mi.Bool(True)
     emitted = _emitted(scene, si, mi.Bool(True))
-    if limits.visible_only:  # a factor: the scalar variant also evaluates inactive emitters
+    if limits.visible_only:
         emitted *= dr.select(visible, 1.0, 0.0)
     flags = mi.BSDFFlags
     lobes = []
@@ -242,10 +237,8 @@ def _continue_paths(
     def step(depth: Any, s0: Any, s1: Any, s2: Any, active: Any, ray: Any, gain: Any, place: Any, pdf: Any,
              delta: Any, random: Any) -> Any:  # fmt: skip
         si = scene.ray_intersect(ray, active)
-        rival = 0.0
-        if si.emitter(scene) is not None:  # None only in the scalar variant
-            sample = mi.DirectionSample3f(scene, si, place)
-            rival = scene.pdf_emitter_direction(place, sample, active & (delta ^ True))
+        sample = mi.DirectionSample3f(scene, si, place)
+        rival = scene.pdf_emitter_direction(place, sample, active & (delta ^ True))
         share = dr.select(delta, 1.0, pdf / dr.maximum(pdf + rival, TINY))
         emitted = _emitted(scene, si, active) * dr.select(active, share, 0.0)
         limited = _limited([gain[i, 0] * emitted for i in range(3)], limits.clamp, depth > 1)
@@ -289,15 +282,6 @@ def _scatter(
         [S0, S1, S2] of the direct light at the camera; and (active, ray, gain, place, density, delta) of the ray that
         leaves.
     """
-    if active is False:  # the scalar variant: there is no surface
-        return [mi.UnpolarizedSpectrum(0.0)] * 3, (
-            False,
-            mi.Ray3f(ray),
-            gain,
-            mi.Interaction3f(si),
-            0.0,
-            False,
-        )
     choose, turn, light = numbers
     bsdf = si.bsdf(ray)
     ds, brought = scene.sample_emitter_direction(si, light, True, active)
@@ -312,7 +296,6 @@ def _scatter(
     direct = [back[i, 0] * arriving for i in range(3)]
     gain = gain @ si.to_world_mueller(weight, -wo, si.wi)
     leaving = si.spawn_ray(si.to_world(wo))
-    leaving.wavelengths = ray.wavelengths
     active = active & (density > 0)
     return direct, (active, mi.Ray3f(leaving), gain, mi.Interaction3f(si), density, delta)
 
@@ -326,19 +309,16 @@ def _russian_roulette(state: tuple[Any, ...], number: Any, where: Any) -> tuple[
 
 def _emitted(scene: Any, si: Any, active: Any) -> Any:
     """Return the unpolarized radiance of the light source or environment at an intersection."""
-    emitter = si.emitter(scene)
-    return mi.UnpolarizedSpectrum(0.0) if emitter is None else emitter.eval(si, active)[0, 0]
+    return si.emitter(scene).eval(si, active)[0, 0]
 
 
 def _visible(si: Any) -> Any:
     """Return True if the camera sees the surface at an intersection. Return False for lights and the environment."""
-    if si.shape is None:  # occurs only in the scalar variant
-        return False
     return si.shape.eval_attribute_1(VISIBLE, si, mi.Bool(si.is_valid())) > 0.5
 
 
 def _limited(light: list[Any], limit: float, where: Any) -> list[Any]:
-    """Scale down a Stokes vector if S0 exceeds the limit at any wavelength. A limit of 0 has no effect."""
+    """Scale down a Stokes vector if S0 exceeds the limit. A limit of 0 has no effect."""
     if limit <= 0:
         return light
     peak = dr.max(light[0])

@@ -1,12 +1,17 @@
 """Scenes, recipes and metrics as objects: what is accepted, what other processes receive, and the figures."""
 
+import base64
+import json
 import re
 import types
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
+import numpy as np
+import pandas as pd
 import pytest
 import torch
 from comparison_records import results, run
@@ -21,7 +26,7 @@ from polarguide.results.evaluation import table
 from polarguide.results.evaluation.record import read_metrics
 from polarguide.training.losses import Weights, term
 from polarguide_bench.children import Definitions
-from polarguide_bench.figures import write_figures
+from polarguide_bench.figures import read_curve, training_curves, write_figures
 from polarguide_bench.objects import (
     chosen_recipes,
     packed_definitions,
@@ -252,3 +257,27 @@ def test_a_notebook_displays_progress(
     reporter.say("done")
     reporter.warn("dark")
     assert capsys.readouterr().out == "done\nwarning: dark\n"
+
+
+def test_a_log_becomes_a_curve(tmp_path: Path) -> None:
+    rows: list[dict[str, float]] = [
+        {"step": 10 * i + 9, "seconds": i / 2, "psnr": 20.0 + i} for i in range(1000)
+    ]
+    rows[500]["held_out"] = 25.5
+    (tmp_path / "log.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows) + '{"step": 3')
+    curve = read_curve(tmp_path)
+    assert (curve["step"].min(), curve["step"].max()) == (10, 9970)
+    assert len(curve) < 300
+    inner = curve[25:-25]
+    np.testing.assert_allclose(inner["psnr"], 20 + (inner["step"] - 10) / 10)  # a line stays one
+    assert curve["held_out"].dropna().tolist() == [25.5]
+
+
+def test_curves_are_an_svg_file_with_any_name() -> None:
+    curve = pd.DataFrame(
+        {"step": [1, 2], "seconds": [0.1, 0.2], "psnr": [20.0, 21.0], "held_out": [np.nan, 20.5]}
+    )
+    head, data = training_curves({"a<b $x$ \\frac": curve, "empty": curve[:0]}).split(",")
+    assert head == "data:image/svg+xml;base64"
+    texts = {element.text for element in ElementTree.fromstring(base64.b64decode(data)).iter()}
+    assert {"a<b $x$ \\frac", "PSNR (dB)", "steps", "seconds"} <= texts

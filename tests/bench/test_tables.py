@@ -1,26 +1,14 @@
 """Means, spreads and tables on numbers that can be checked by head, and the files that hold them."""
 
 import io
-import json
 from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree
 
-import numpy as np
 import pandas as pd
 import pytest
 from comparison_records import part, results, run, unfinished
 
 from polarguide.results.evaluation.table import COLUMNS
-from polarguide_bench.report import (
-    curves_svg,
-    exposure_svg,
-    read_curve,
-    read_study,
-    smoothed,
-    study_svg,
-    ticks,
-)
 from polarguide_bench.results import Cell, Results, cell_of
 from polarguide_bench.tables import (
     Section,
@@ -229,7 +217,7 @@ def test_frames_are_the_csv_files(tmp_path: Path) -> None:
         "rock": part(None, psnr=1.0),
     }
     runs = [seen("x, y", "r", s, **parts) for s in (0, 1)]
-    runs += [run("x, y", FREE, s, psnr=28.0, haze_alpha=0.125 + s / 8) for s in (0, 1)]
+    runs += [run("x, y", FREE, s, psnr=28.0, haze_true=0.125 + s / 8) for s in (0, 1)]
     found = results([*runs, run("z", "r", 0, psnr=1.0)])
     write_tables(tmp_path, found)
     scores = pd.read_csv(tmp_path / "results.csv")
@@ -242,8 +230,8 @@ def test_frames_are_the_csv_files(tmp_path: Path) -> None:
         c.key for c in COLUMNS if c.unit == "%" and c.factor == 100
     }
     free = scores.set_index(["scene", "recipe"]).loc[("x, y", FREE)]
-    assert free["haze_alpha_percent"] == 18.75
-    assert free["haze_alpha_percent_spread"] == pytest.approx(12.5 / 2**0.5)
+    assert free["haze_true_percent"] == 18.75
+    assert free["haze_true_percent_spread"] == pytest.approx(12.5 / 2**0.5)
     differences = pd.read_csv(tmp_path / "differences.csv")
     assert differences["mean"].tolist() == found.differences["mean"].tolist()
     parts = pd.read_csv(tmp_path / "parts.csv").set_index("name")
@@ -306,101 +294,3 @@ def test_terminals_and_spreadsheets_obey_no_name_in_a_file() -> None:
         "'@x",
         "cup",
     ]
-
-
-SVG = "{http://www.w3.org/2000/svg}"
-FAMILY = results(
-    [run(f"views-{n}", r, 0, psnr=20.0 + n * k) for n in (9, 18, 36) for k, r in enumerate(("3dgs", "a<b"))]
-)
-
-
-def drawn(values: tuple[float, ...], parameter: str = "views") -> ElementTree.Element:
-    text = study_svg(FAMILY, {s: (parameter, v) for s, v in zip(FAMILY.scenes, values, strict=True)})
-    assert text is not None
-    return ElementTree.fromstring(text)
-
-
-def words(root: ElementTree.Element, tag: str = "text") -> list[str]:
-    return [element.text or "" for element in root.iter(f"{SVG}{tag}")]
-
-
-def test_a_family_is_drawn() -> None:
-    root = drawn((9.0, 18.0, 36.0))
-    assert len(list(root.iter(f"{SVG}polyline"))) == 2  # nothing is known about normals: one panel
-    assert len(list(root.iter(f"{SVG}circle"))) == 6
-    assert "a<b, views 36: 56.00" in words(root, "title")
-    assert {"training views", "PSNR (dB) ↑", "3dgs", "a<b"} <= set(words(root))
-
-
-@pytest.mark.parametrize(("values", "at_zero"), [((1.3, 1.5, 1.7), False), ((0.1, 1.5, 1.7), True)])
-def test_the_axis_starts_at_zero_only_where_that_is_near(values: tuple[float, ...], at_zero: bool) -> None:
-    assert ("0" in words(drawn(values, "index"))) is at_zero
-
-
-@pytest.mark.parametrize(
-    "studies", [(("views", 9.0), None), (("views", 9.0), ("noise", 1.0)), (("views", 9.0), ("views", 9.0))]
-)
-def test_what_is_not_a_family_is_not_drawn(studies: tuple[tuple[str, float] | None, ...]) -> None:
-    assert study_svg(FAMILY, dict(zip(FAMILY.scenes, studies, strict=False))) is None
-
-
-def test_the_number_is_read_from_the_scene(tmp_path: Path) -> None:
-    assert read_study(tmp_path) is None
-    (tmp_path / "scene.json").write_text(json.dumps({"study": {"parameter": "noise", "value": 2}}))
-    assert read_study(tmp_path) == ("noise", 2.0)
-    (tmp_path / "scene.json").write_text("{")
-    assert read_study(tmp_path) is None
-
-
-def test_the_chart_of_exposures_has_a_point_for_each_row() -> None:
-    keys = ("psnr_foreground", "normal_mae_deg", "specular_psnr", "diffuse_psnr")
-    found = results([run("cup", name, 0, **dict.fromkeys(keys, 20.0)) for name in ("four", "one")])
-    text = exposure_svg(found, {("cup", "four"): 252, ("cup", "one"): 63})
-    assert text is not None
-    root = ElementTree.fromstring(text)
-    assert words(root, "title").count("cup, four, 252 pictures: 20.00") == 4
-    shown = words(root)
-    assert shown.index("one") < shown.index("63") < shown.index("four") < shown.index("252")
-
-
-def test_a_log_becomes_a_curve(tmp_path: Path) -> None:
-    rows = [{"step": 10 * i + 9, "seconds": i / 2, "psnr": 20.0 + i} for i in range(1000)]
-    (tmp_path / "log.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows) + '{"step": 3')
-    curve = read_curve(tmp_path, "a")
-    assert (curve.steps[0], curve.steps[-1], curve.seconds[-1]) == (10, 10000, 499.5)
-    assert len(curve.psnr) <= 240
-    np.testing.assert_allclose(curve.psnr, 20 + (curve.steps - 10) / 10)  # a line stays one under smoothing
-    assert 'aria-label="PSNR over steps"' in curves_svg([curve], "steps")
-    assert read_curve(tmp_path / "none", "a") is None
-
-
-def test_held_out_scores_of_a_log_are_a_second_panel(tmp_path: Path) -> None:
-    rows: list[dict[str, float]] = [{"step": 10 * i + 9, "seconds": i / 2, "psnr": 20.0} for i in range(10)]
-    rows[4]["held_out"] = 25.5
-    rows[9]["held_out"] = 27.5
-    (tmp_path / "log.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
-    curve = read_curve(tmp_path, "a")
-    assert curve.held_out.tolist() == [[50, 2.0, 25.5], [100, 4.5, 27.5]]
-    assert "PSNR (dB), a few held-out views" in curves_svg([curve], "seconds")
-    assert "PSNR (dB), a few held-out views" not in curves_svg(
-        [curve._replace(held_out=curve.held_out[:1])], "steps"
-    )
-
-
-def test_smoothing_keeps_the_mean_of_noise_and_both_ends() -> None:
-    values = np.random.default_rng(0).normal(25.0, 1.0, 2000)
-    smooth = smoothed(values, 0.05)
-    assert smooth[100:-100].std() < 0.2
-    assert (smooth[0], smooth[-1]) == pytest.approx((values[0], values[-1]))
-
-
-@pytest.mark.parametrize(
-    ("low", "high", "expected"),
-    [
-        (0, 60, [0, 10, 20, 30, 40, 50, 60]),
-        (18.3, 21.2, [18, 18.5, 19, 19.5, 20, 20.5, 21, 21.5]),
-        (5, 5, [5, 5.0000002]),
-    ],
-)
-def test_ticks_are_round_and_enclose(low: float, high: float, expected: list[float]) -> None:
-    assert ticks(low, high) == expected

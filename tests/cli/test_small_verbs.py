@@ -1,10 +1,8 @@
 """Verbs that write one thing: scale, tables, bench, synth, calibrate."""
 
 import csv
-import io
 import json
 import os
-import re
 import signal
 import subprocess
 import sys
@@ -24,8 +22,6 @@ from polarguide_bench.options import CompareOptions
 from polarguide_bench.plan import Comparison, plan_runs, scene_entries
 from polarguide_bench.results import read_results
 from polarguide_shots.ring_scale import ring_scale
-from polarguide_synth.schema import SceneSpec
-from polarguide_synth.settings import Variant, choose_variant
 
 
 def test_the_command_writes_it_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -48,53 +44,6 @@ def test_without_mitsuba_its_wheel_is_named(
     (line,) = capsys.readouterr().err.splitlines()
     assert f"Install it with {install_extra('synth')} and" in line
     assert not (tmp_path / "x").exists()
-
-
-class Keyboard(io.StringIO):
-    """A terminal on which one line is typed."""
-
-    def isatty(self) -> bool:
-        return True
-
-
-@pytest.mark.parametrize(
-    ("terminal", "options", "typed", "begun"),
-    [
-        (True, [], "\n", False),
-        (True, [], "", False),
-        (True, [], "y\n", True),
-        (True, ["--yes"], "", True),
-        (True, ["--size", "16x16", "--samples", "1"], "", True),
-        (False, [], "", True),
-        (True, ["--sweep", "noise=0,1"], "n\n", False),
-    ],
-)
-def test_a_long_rendering_is_announced_and_asked_for_before_there_is_a_folder(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str],
-    terminal: bool, options: list[str], typed: str, begun: bool,
-) -> None:  # fmt: skip
-    """Without LLVM the scene takes half a day; sixteen pixels each way with one path each do not."""
-    pytest.importorskip("mitsuba", reason="no Mitsuba -> pip install '.[synth]'")
-    started: list[Path] = []
-
-    def build(spec: SceneSpec, out: Path, variant: Variant) -> None:
-        started.append(out)
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("polarguide_synth.settings.missing_llvm", lambda: "none was found")
-    monkeypatch.setattr("polarguide_synth.render.build_scene", build)
-    monkeypatch.setattr("sys.stdin", Keyboard(typed) if terminal else io.StringIO(typed))
-    monkeypatch.setattr("polarguide.cli.console.console._force_terminal", terminal)
-    out = tmp_path / "x"
-    status = run(["synth", "proof", "--out", str(out), *options])
-    choose_variant("rgb", threads=1)
-    said = capsys.readouterr()
-    assert "LLVM" in said.out
-    told = re.search(r"Rendering will take about \d+ (\w+)", said.out)
-    assert told[1] == ("minutes" if "--size" in options else "hours")
-    assert status == (130 if begun else 2)
-    assert (bool(started), out.exists()) == (begun, begun)
-    assert ("expected yes to about" in said.err) != begun
 
 
 def test_from_shots_to_a_corrected_scene(

@@ -11,29 +11,28 @@ import numpy as np
 import pytest
 import scipy.ndimage
 import torch
+from started_mitsuba import started_mitsuba
 
 from polarguide import optics
 from polarguide.capture import load_scene
 from polarguide.capture.colmap.model import read_model
 from polarguide.cli.app import run
 from polarguide_synth.sensor import Sensor, behind_filter
-from polarguide_synth.settings import choose_variant
+from polarguide_synth.settings import start_mitsuba
 from tests.synth.test_scene_folder import TINY
 
 
 @pytest.fixture
 def polarguide(capsys: pytest.CaptureFixture[str]) -> Iterator[Callable[..., str]]:
     """Runs a command line that ends well; returns what it prints."""
-    pytest.importorskip("mitsuba", reason="no Mitsuba -> pip install '.[synth]'")
-    if choose_variant("rgb", threads=1).note:  # the scalar variant takes minutes
-        pytest.skip("no LLVM for Mitsuba's compiled variants -> apt-get install libllvm19")
+    started_mitsuba()
 
     def run_and_read(*arguments: str) -> str:
         assert run(list(arguments)) == 0
         return capsys.readouterr().out
 
     yield run_and_read
-    choose_variant("rgb", threads=1)
+    start_mitsuba(threads=1)
 
 
 @pytest.mark.parametrize("sensor", ["imx250mzr", "IMX250MYR"])

@@ -92,7 +92,6 @@ WRONG = [
     ("inspect empty --out file", "file", ""),
     ("synth cat --out new", "cat", ""),
     (f"{SYNTH} --size big", "--size", "big"),
-    (f"{SYNTH} --sweep size=1", "--sweep", "size"),
     ("scale --diameter nan --out new.svg", "--diameter", "nan"),
     ("scale --diameter 3 --out new.svg", "--diameter", "3"),
     ("scale --diameter 1000 --out new.svg", "--diameter", "1000"),

@@ -104,8 +104,6 @@ CASES += table(
          ["synth", f"{NO_TEXT}/{SPEC}", *FEW.split()[2:]]),
 ) + table(
     "synth with", FEW,
-    Case("a sweep of NaN", more="--sweep noise=nan", ci=True),
-    Case("a sweep of 5000", more="--sweep views=" + ",".join(map(str, range(3, 5000)))),
     Case("10^18 samples", command=SYNTH.replace("--samples 1", f"--samples {10**18}")),
     Case("pictures of 10^8 columns", command="synth proof --out new --size 99999999x1"),
     change=write_json(SPEC, ball()),

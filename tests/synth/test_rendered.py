@@ -26,7 +26,7 @@ from polarguide_synth.colmap import place_cameras
 from polarguide_synth.ground_truth import base_colors, ground_truth_maps, intersect
 from polarguide_synth.schema import parse_scene
 from polarguide_synth.sensor import LobeRadiance, Sensor, mosaic, noisy, render_lobes
-from polarguide_synth.settings import PRESETS, Variant, find_scene
+from polarguide_synth.settings import PRESETS, find_scene
 from polarguide_synth.transport import PathLimits
 
 INDEX = 1.5
@@ -53,9 +53,9 @@ def camera() -> Camera:
 
 
 @pytest.fixture(scope="module")
-def ball(variant: Variant, tmp_path_factory: pytest.TempPathFactory) -> BuiltScene:
+def ball(mitsuba: None, tmp_path_factory: pytest.TempPathFactory) -> BuiltScene:
     folder = tmp_path_factory.mktemp("ball")
-    return build_scene(parse_scene(BALL, "ball", folder=folder), folder, variant)
+    return build_scene(parse_scene(BALL, "ball", folder=folder), folder)
 
 
 @pytest.fixture(scope="module")
@@ -101,7 +101,7 @@ def test_each_lobe_obeys_fresnel(
 
 
 def test_specular_light_is_fresnels_reflectance(
-    light: LobeRadiance, normals: tuple[Tensor, Tensor], camera: Camera, variant: Variant
+    light: LobeRadiance, normals: tuple[Tensor, Tensor], camera: Camera
 ) -> None:
     normal, where = normals
     zenith = optics.zenith(normal, camera.rays(dtype=torch.float64))
@@ -110,13 +110,11 @@ def test_specular_light_is_fresnels_reflectance(
     where = where & (zenith < math.radians(75))
     ratio = found[where] / ((rs + rp) / 2)[where]
     assert ratio.mean() == pytest.approx(1, abs=5e-3)
-    assert (ratio - 1).abs().max() < (
-        0.02 if variant.color == "rgb" else 0.1
-    )  # sampled wavelengths are noisy
+    assert (ratio - 1).abs().max() < 0.02
 
 
 def test_full_polarization_at_brewsters_angle(
-    ball: BuiltScene, camera: Camera, variant: Variant, normals: tuple[Tensor, Tensor], light: LobeRadiance
+    ball: BuiltScene, camera: Camera, normals: tuple[Tensor, Tensor], light: LobeRadiance
 ) -> None:
     normal, where = normals
     zenith = optics.zenith(normal, camera.rays(dtype=torch.float64))
@@ -200,13 +198,10 @@ SURFACES = {
 }  # fmt: skip
 
 
-def test_material_truth_is_what_mitsuba_renders_with(
-    variant: Variant, camera: Camera, tmp_path: Path
-) -> None:
+@pytest.mark.usefixtures("mitsuba")
+def test_material_truth_is_what_mitsuba_renders_with(camera: Camera, tmp_path: Path) -> None:
     """The reference for dielectrics is Mitsuba's diffuse lobe without two passages through the coat."""
-    if variant.note:
-        pytest.skip("a sampled spectrum has no exact colors")
-    built = build_scene(parse_scene(SURFACES, "surfaces", folder=tmp_path), tmp_path, variant)
+    built = build_scene(parse_scene(SURFACES, "surfaces", folder=tmp_path), tmp_path)
     rays = camera.world_rays().numpy().astype(np.float64).reshape(-1, 3)
     origins = np.broadcast_to(camera.center.numpy(), rays.shape)
     hits = intersect(built, origins, rays)
@@ -256,7 +251,7 @@ def test_base_color_is_the_mean_of_each_pixel(ball: BuiltScene, camera: Camera) 
 
 
 def test_lobes_add_up_to_mitsubas_own_path_tracer(
-    ball: BuiltScene, camera: Camera, light: LobeRadiance, variant: Variant
+    ball: BuiltScene, camera: Camera, light: LobeRadiance
 ) -> None:
     """The same scene by ``stokes`` over ``path``; its frame differs off the axis, S0 and DoLP do not."""
     import mitsuba as mi
@@ -278,17 +273,14 @@ def test_lobes_add_up_to_mitsubas_own_path_tracer(
     ]
     other = np.stack(found).reshape(3, 3, camera.height, camera.width).transpose(0, 2, 3, 1)
     mine = render_lobes(ball.scenes, camera, 64, seed=5, limits=PathLimits(depth=3)).stokes
-    channel = slice(0, 1) if variant.color == "rgb" else slice(0, 3)
     inside = np.s_[5:11, 6:14]
     for image in (other, mine):
         assert image[0][inside].min() > 0
     a, b = (
-        optics.luminance(torch.from_numpy(image[(slice(None), *inside)][..., channel]))
-        for image in (other, mine)
+        optics.luminance(torch.from_numpy(image[(slice(None), *inside)][..., :1])) for image in (other, mine)
     )
     assert float(a[0].mean()) == pytest.approx(float(b[0].mean()), rel=0.02)
-    # Sampled wavelengths make noise of their own.
-    assert (optics.dolp(a) - optics.dolp(b)).abs().mean() < (5e-3 if variant.color == "rgb" else 2e-2)
+    assert (optics.dolp(a) - optics.dolp(b)).abs().mean() < 5e-3
 
 
 HEAD = "ply\nformat binary_little_endian 1.0\nelement vertex {}\n" + "".join(
@@ -306,7 +298,7 @@ def corners(*numbers: int) -> bytes:
     return bytes([len(numbers)]) + struct.pack(f"<{len(numbers)}i", *numbers)
 
 
-@pytest.mark.usefixtures("variant")
+@pytest.mark.usefixtures("mitsuba")
 def test_a_triangle(tmp_path: Path) -> None:
     (tmp_path / "m.ply").write_bytes(ply(3, 1, PLACES + corners(0, 1, 2)))
     mesh = _user_mesh(tmp_path / "m.ply")
@@ -314,7 +306,7 @@ def test_a_triangle(tmp_path: Path) -> None:
     assert mesh.faces.tolist() == [[0, 1, 2]]
 
 
-@pytest.mark.usefixtures("variant")
+@pytest.mark.usefixtures("mitsuba")
 @pytest.mark.parametrize(
     ("name", "data"),
     [
@@ -336,7 +328,7 @@ def test_damaged_ones_are_named(tmp_path: Path, name: str, data: bytes) -> None:
     Fault(name).raised_by(_user_mesh, tmp_path / name)
 
 
-@pytest.mark.usefixtures("variant")
+@pytest.mark.usefixtures("mitsuba")
 @pytest.mark.parametrize("seed", range(40))
 def test_random_damage_is_read_or_named(tmp_path: Path, seed: int) -> None:
     """Corners beyond the points once made Mitsuba write where nothing was, which ended a later test or none."""

@@ -14,7 +14,6 @@ from polarguide.core.errors import PolarguideError
 from polarguide_synth.build import _mesh, area_light_dict, make_mesh
 from polarguide_synth.colmap import place_cameras
 from polarguide_synth.mesh import Mesh, write_ply
-from polarguide_synth.render import parse_sweep
 from polarguide_synth.schema import (
     SceneSpec,
     parse_scene,
@@ -224,12 +223,6 @@ def test_overrides_reach_foreground_plastic_only() -> None:
     Fault(expected="above 1 and below 4", found="0.5").raised_by(
         Overrides(index=0.5).apply, find_scene("cup")
     )
-
-
-def test_sweeps() -> None:
-    assert parse_sweep("noise=2,0,1").values == (0.0, 1.0, 2.0)
-    for text in ("noise", "noise=", "size=1,2", "views=1.5", "noise=a", "noise=nan", "views=inf"):
-        Fault("--sweep").raised_by(parse_sweep, text)
 
 
 def test_ply_files_hold_the_mesh(tmp_path: Path) -> None:

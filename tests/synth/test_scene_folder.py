@@ -16,17 +16,10 @@ from polarguide import optics
 from polarguide.capture import load_scene
 from polarguide.core.progress import Reporter
 from polarguide_synth import render as runner
-from polarguide_synth.folder import MANIFEST, photograph, scene_digest, verify_scene
-from polarguide_synth.render import Sweep, sweep_scenes, synthesize
+from polarguide_synth.folder import MANIFEST, photograph, scene_digest
+from polarguide_synth.render import synthesize
 from polarguide_synth.schema import SceneSpec, parse_scene
-from polarguide_synth.settings import (
-    OLDEST_LLVM,
-    Overrides,
-    SynthSettings,
-    Variant,
-    choose_variant,
-    rough_time,
-)
+from polarguide_synth.settings import Overrides, SynthSettings, rough_time, start_mitsuba
 
 TINY = {
     "name": "tiny",
@@ -42,8 +35,6 @@ TINY = {
     ],
 }  # fmt: skip
 SETTINGS = SynthSettings(size="16x16", samples=1, points=60)
-# The scalar variant has no threads, and takes minutes for pictures with little noise.
-COMPILED = pytest.mark.parametrize("variant", ["compiled"], indirect=True)
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +43,7 @@ def spec() -> SceneSpec:
 
 
 @pytest.fixture(scope="module")
-def scene(spec: SceneSpec, variant: Variant, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def scene(spec: SceneSpec, mitsuba: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return synthesize(spec, tmp_path_factory.mktemp("synth") / "tiny", SETTINGS, Reporter(), threads=1)
 
 
@@ -85,7 +76,7 @@ def test_points_lie_near_surfaces(scene: Path) -> None:
 
 
 def test_object_only_blackens_all_else_and_nothing_of_the_object(
-    scene: Path, spec: SceneSpec, variant: Variant, tmp_path: Path
+    scene: Path, spec: SceneSpec, tmp_path: Path
 ) -> None:
     """Light, ground truth and points of the object are those of the full scene, whose ground it still mirrors."""
     alone = msgspec.structs.replace(spec, object_only=True)
@@ -131,15 +122,14 @@ def test_rendering_goes_on_to_the_same_files(
         assert (scene / name).read_text() == (out / name).read_text()
 
 
-@COMPILED
-def test_the_files_do_not_depend_on_the_threads(spec: SceneSpec, variant: Variant, tmp_path: Path) -> None:
+def test_the_files_do_not_depend_on_the_threads(spec: SceneSpec, mitsuba: None, tmp_path: Path) -> None:
     settings = SynthSettings(size="64x48", samples=16, points=60)
     two = Overrides(views=2).apply(spec)
     digests = []
     for threads in (1, 2):
         out = synthesize(two, tmp_path / str(threads), settings, Reporter(), threads=threads)
         digests.append(scene_digest(out))
-    choose_variant("rgb", threads=1)
+    start_mitsuba(threads=1)
     assert digests[0] == digests[1]
 
 
@@ -182,77 +172,37 @@ def test_other_settings_and_other_folders_are_refused(scene: Path, spec: SceneSp
     )
 
 
-def test_a_sweep_over_views_shares_its_test_views(spec: SceneSpec, variant: Variant, tmp_path: Path) -> None:
-    folders = sweep_scenes(
-        spec, tmp_path / "s", SETTINGS, Overrides(), Sweep("views", (2.0, 3.0)), Reporter(), threads=1
-    )
-    assert [folder.name for folder in folders] == ["views-2", "views-3"]
-    scenes = [load_scene(folder) for folder in folders]
-    assert [len(scene.train_views) for scene in scenes] == [2, 3]
-    assert scenes[0].test_names == scenes[1].test_names
-    assert (scenes[0].test_views[0].codes == scenes[1].test_views[0].codes).all()
-    study = json.loads((folders[0] / "scene.json").read_text())["study"]
-    assert study == {"parameter": "views", "value": 2.0}
-    for folder in folders:
-        verify_scene(folder)
-
-
-def test_a_sweep_over_more_views_than_there_are_is_refused_before_anything_is_rendered(
-    spec: SceneSpec, tmp_path: Path
-) -> None:
-    sweep = Sweep("views", (2.0, 300.0))
-    Fault("--sweep", "training views", "300", "--views").raised_by(
-        sweep_scenes, spec, tmp_path / "s", SETTINGS, Overrides(), sweep, Reporter()
-    )
-    assert not (tmp_path / "s").exists()
-
-
-def test_members_of_a_sweep_sort_like_their_numbers(
-    spec: SceneSpec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def written(spec: SceneSpec, out: Path, *_: object, **__: object) -> Path:
-        out.mkdir()
-        (out / "scene.json").write_text("{}")
-        return out
-
-    monkeypatch.setattr(runner, "synthesize", written)
-    family = Sweep("noise", (0.0, 1.5, 12.0))
-    folders = sweep_scenes(spec, tmp_path, SETTINGS, Overrides(), family, Reporter())
-    assert [folder.name for folder in folders] == ["noise-00", "noise-01.5", "noise-12"]
-
-
-def test_without_llvm_the_scalar_variant_is_taken(variant: Variant, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("polarguide_synth.settings.missing_llvm", lambda: "none was found")
-    try:
-        found = choose_variant("rgb")
-        assert found.note
-        assert found.color == "spectral"
-        assert f"LLVM {OLDEST_LLVM}" in found.note
-        assert "\n" not in found.note
-    finally:
-        monkeypatch.undo()
-        choose_variant("rgb", threads=1)
-    assert rough_time(9 * 3600) == "about 9 hours"
-    assert rough_time(600) == "about 10 minutes"
-
-
 def test_the_time_expected_is_of_what_is_left(
-    scene: Path, spec: SceneSpec, variant: Variant, tmp_path: Path
+    scene: Path, spec: SceneSpec, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Four views, of which the held-out one takes four times as many paths; a finished scene takes none."""
     new = runner.Plan(spec, SETTINGS, tmp_path / "new")
-    paths = 16 * 16 * SETTINGS.samples * (4 + 3)
-    assert runner.expected_time([new, new], Reporter()) == pytest.approx(
-        2 * paths / choose_variant("rgb").paths_per_second
-    )
-    choose_variant("rgb", threads=1)
+    assert new.paths_left() == 16 * 16 * SETTINGS.samples * (4 + 3)
+    monkeypatch.setattr(runner, "PATHS_PER_SECOND", new.paths_left() / (2 * 3600))
+    reporter = Reporter()
+    said: list[str] = []
+    monkeypatch.setattr(reporter, "say", said.append)
+    runner.report_expected_time([runner.Plan(spec, SETTINGS, scene)], reporter, threads=1)
+    assert said == []
+    runner.report_expected_time([new], reporter, threads=1)
+    assert "about 2 hours" in said[0]
     assert not new.out.exists()
-    assert runner.expected_time([runner.Plan(spec, SETTINGS, scene)], Reporter()) == 0
     begun = tmp_path / "begun"
     shutil.copytree(scene, begun)
     (begun / "scene.json").unlink()
     (begun / "polar" / "v001_045.png").unlink()
     assert runner.Plan(spec, SETTINGS, begun).paths_left() == 16 * 16 * SETTINGS.samples
+    assert rough_time(600) == "about 10 minutes"
+
+
+def test_without_llvm_the_package_is_named(
+    spec: SceneSpec, mitsuba: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("DRJIT_LIBLLVM_PATH", str(tmp_path / "none"))
+    Fault("synth", "LLVM 16", "does not exist", "libllvm19").raised_by(
+        synthesize, spec, tmp_path / "new", SETTINGS, Reporter()
+    )
+    assert not (tmp_path / "new").exists()
 
 
 def test_the_photograph_of_a_gray_scene_has_three_channels(tmp_path: Path) -> None:

@@ -19,7 +19,7 @@ from PIL import Image
 from polarguide.visualization.figures import Picture, check_picture
 
 BASE = "polarguide.visualization"
-"""Package whose folder ``page`` contains the common templates ``base.html`` and ``chart.svg``."""
+"""Package whose folder ``page`` contains the common template ``base.html``."""
 
 
 @lru_cache

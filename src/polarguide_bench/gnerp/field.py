@@ -1,14 +1,8 @@
-"""Fields of signed distance, color and background, in the region that the cameras surround.
-
-``GridField`` consists of dense grids. ``NetworkField`` consists of the networks of the publication. Its distance
-network has 8 layers of width 256, its radiance network 4 layers of width 256 (GNeRP after NeuS; initialization of Gropp
-et al. 2020). It is practical only on a GPU, because a step differentiates the distance twice.
-"""
+"""Field of signed distance, color and background, in the region that the cameras surround."""
 
 from __future__ import annotations
 
 import math
-from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -121,9 +115,14 @@ class Geometry(NamedTuple):
 
 
 class Field(nn.Module):
-    """Field of signed distance and color, which rays sample.
+    """Field of signed distance and color on dense grids, with a small network for the color. Rays sample it.
 
     Its coordinates are relative to the center of a ``Region`` and in the region's unit of length.
+
+    Args:
+        region: the region.
+        shape: sizes of grids and networks.
+        generator: source of the initial values.
 
     Attributes:
         region: the region.
@@ -134,9 +133,6 @@ class Field(nn.Module):
         head: network that computes the color.
     """
 
-    map_side = MAP_SIDE
-    head: nn.Module
-
     def __init__(self, region: Region, shape: FieldShape, generator: torch.Generator) -> None:
         super().__init__()
         self.region = region
@@ -145,17 +141,14 @@ class Field(nn.Module):
         self.background = Background(shape, generator)
         self.register_buffer("direction_share", torch.ones(()))
         self.direction_share: Tensor
-        side = self.map_side
-        self.register_buffer("distances", torch.zeros(1, 1, side, side, side))
+        self.register_buffer("distances", torch.zeros(1, 1, MAP_SIDE, MAP_SIDE, MAP_SIDE))
         self.distances: Tensor
-
-    @abstractmethod
-    def geometry(self, places: Tensor) -> Geometry:
-        """Compute the geometry at positions [N, 3], differentiable in all parameters."""
-
-    @abstractmethod
-    def lattice(self, axes: Sequence[Tensor]) -> Tensor:
-        """Compute distances [X, Y, Z] at all combinations of coordinates [X], [Y] and [Z], without a gradient."""
+        self.first_radius = region.first_radius(shape.first_radius)
+        self.shape_grids = SmoothGrids(shape.resolutions)
+        self.features = FeatureGrids(shape.resolutions, shape.channels, 0.1, generator)
+        inputs = self.features.width + 3 + 3 + DIRECTION_WIDTH
+        self.head = network((inputs, shape.width, shape.width, 3), generator)
+        self.map_distances()
 
     def color(self, places: Tensor, directions: Tensor, normals: Tensor, features: Tensor) -> Tensor:
         """Return display colors [N, 3] in [0, 1] along rays of these directions."""
@@ -165,7 +158,7 @@ class Field(nn.Module):
 
     def map_distances(self) -> None:
         """Update ``distances``."""
-        axis = self.region.places(torch.linspace(-1, 1, self.map_side, device=self.distances.device))
+        axis = self.region.places(torch.linspace(-1, 1, MAP_SIDE, device=self.distances.device))
         self.distances.copy_(self.lattice((axis, axis, axis))[None, None])
 
     @property
@@ -180,27 +173,11 @@ class Field(nn.Module):
         grid = cube.reshape(1, 1, 1, -1, 3).flip(-1)
         return grid_sample(self.distances, grid, align_corners=True).view(places.shape[:-1])
 
-
-class GridField(Field):
-    """Field of dense grids over the cube of the region, with a small network for the color.
-
-    Args:
-        region: the region.
-        shape: sizes of grids and networks.
-        generator: source of the initial values.
-    """
-
-    def __init__(self, region: Region, shape: FieldShape, generator: torch.Generator) -> None:
-        super().__init__(region, shape, generator)
-        self.first_radius = region.first_radius(shape.first_radius)
-        self.shape_grids = SmoothGrids(shape.resolutions)
-        self.features = FeatureGrids(shape.resolutions, shape.channels, 0.1, generator)
-        inputs = self.features.width + 3 + 3 + DIRECTION_WIDTH
-        self.head = network((inputs, shape.width, shape.width, 3), generator)
-        self.map_distances()
-
     def geometry(self, places: Tensor) -> Geometry:
-        """See ``Field``: the sum of the initial sphere and the grids."""
+        """Compute the geometry at positions [N, 3], differentiable in all parameters.
+
+        The distance is the sum of the initial sphere and the grids.
+        """
         cube, scale = self.region.cube(places)
         added, slope = self.shape_grids(cube)
         distance = places.norm(dim=-1)
@@ -209,7 +186,10 @@ class GridField(Field):
 
     @torch.no_grad()
     def lattice(self, axes: Sequence[Tensor]) -> Tensor:
-        """See ``Field``. Splines are products along the axes, so a grid takes three matrix products."""
+        """Compute distances [X, Y, Z] at all combinations of coordinates [X], [Y] and [Z], without a gradient.
+
+        Splines are products along the axes, so a grid takes three matrix products.
+        """
         x, y, z = torch.meshgrid(*axes, indexing="ij")
         total = (x * x + y * y + z * z).sqrt() - self.first_radius
         cubes = [self.region.cube(axis)[0] for axis in axes]
@@ -256,90 +236,3 @@ def encoded(values: Tensor, frequencies: int) -> Tensor:
     """Encode values [N, D] by themselves and by sine and cosine of F multiples (1, 2, 4, ...), [N, D (1 + 2 F)]."""
     scaled = [2**k * values for k in range(frequencies)]
     return torch.cat((values, *(f(each) for each in scaled for f in (torch.sin, torch.cos))), dim=-1)
-
-
-DEPTH = 8
-"""Number of hidden layers of the distance network."""
-WIDTH = 256
-"""Number of units in each hidden layer of the networks."""
-SKIP = 4
-"""Index of the layer that also receives the input by a skip connection."""
-PLACE_FREQUENCIES = 8
-"""Number of frequencies in the encoding of positions."""
-PLACE_WIDTH = 3 * (1 + 2 * PLACE_FREQUENCIES)
-"""Number of values of an encoded position."""
-SOFTNESS = 100.0
-"""Softplus parameter of the distance network."""
-CHUNK = 1 << 16
-"""Number of lattice points that are evaluated in one batch."""
-
-
-class NetworkField(Field):
-    """Field of two networks: one with a skip connection for the distance, and one for the color.
-
-    Args:
-        region: the region.
-        shape: sizes of grids and networks.
-        generator: source of the initial values.
-    """
-
-    map_side = 65
-
-    def __init__(self, region: Region, shape: FieldShape, generator: torch.Generator) -> None:
-        super().__init__(region, shape, generator)
-        self.layers = _distance_layers(region.first_radius(shape.first_radius) / region.radius, generator)
-        self.head = network((WIDTH + 3 + 3 + DIRECTION_WIDTH, *[WIDTH] * 4, 3), generator)
-        self.map_distances()
-
-    def geometry(self, places: Tensor) -> Geometry:
-        """See ``Field``."""
-        learns = torch.is_grad_enabled()
-        with torch.enable_grad():
-            points = places.detach().requires_grad_()
-            values = self._distance(points)
-            (slope,) = torch.autograd.grad(values[:, 0].sum(), points, create_graph=learns, retain_graph=True)
-        return Geometry(values[:, 0], slope, values[:, 1:])
-
-    @torch.no_grad()
-    def lattice(self, axes: Sequence[Tensor]) -> Tensor:
-        """See ``Field``."""
-        places = torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1)
-        distances = [self._distance(part)[:, 0] for part in places.view(-1, 3).split(CHUNK)]
-        return torch.cat(distances).view(places.shape[:-1])
-
-    def _distance(self, places: Tensor) -> Tensor:
-        """Compute distance and features [N, 1 + WIDTH] at positions [N, 3].
-
-        Positions are scaled to a sphere of radius 1 for the network.
-        """
-        encoding = encoded(places / self.region.radius, PLACE_FREQUENCIES)
-        hidden = encoding
-        for k, layer in enumerate(self.layers):
-            if k == SKIP:
-                hidden = torch.cat((hidden, encoding), dim=-1) / math.sqrt(2)
-            hidden = layer(hidden)
-            if k < DEPTH:
-                hidden = softplus(hidden, SOFTNESS)
-        return torch.cat((self.region.radius * hidden[:, :1], hidden[:, 1:]), dim=-1)
-
-
-def _distance_layers(radius: float, generator: torch.Generator) -> nn.ModuleList:
-    """Create layers whose initial output is the signed distance of a sphere (Gropp et al. 2020), positive outside."""
-    layers = []
-    widths = [PLACE_WIDTH, *[WIDTH] * DEPTH, WIDTH + 1]
-    for k, (inputs, outputs) in enumerate(pairwise(widths)):
-        layer = nn.Linear(inputs, outputs - PLACE_WIDTH if k + 1 == SKIP else outputs)
-        with torch.no_grad():
-            noise = torch.randn(layer.weight.shape, generator=generator)
-            if k == DEPTH:
-                layer.weight.copy_(math.sqrt(math.pi / inputs) + 1e-4 * noise)
-                layer.bias.fill_(-radius)
-            else:
-                layer.weight.copy_(noise * math.sqrt(2 / layer.out_features))
-                layer.bias.zero_()
-                if k == 0:
-                    layer.weight[:, 3:] = 0
-                elif k == SKIP:
-                    layer.weight[:, -(PLACE_WIDTH - 3) :] = 0
-        layers.append(layer)
-    return nn.ModuleList(layers)

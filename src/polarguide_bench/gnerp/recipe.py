@@ -9,15 +9,13 @@ from typing import Any, Literal
 
 from polarguide.training.recipe import values_differ
 
-Representation = Literal["grids", "networks"]
-
 
 @dataclass(frozen=True)
 class FieldShape:
     """Sizes of a field.
 
     Attributes:
-        kind: kind of field: dense grids with a small network, or the networks of the publication.
+        kind: kind of field, for records: dense grids with a small network.
         resolutions: number of cells along a side of each grid.
         channels: number of features of each grid.
         width: number of units in both hidden layers of the small networks.
@@ -27,7 +25,7 @@ class FieldShape:
         first_spread: reciprocal of the initial sharpness, in the unit of the region.
     """
 
-    kind: Representation = "grids"
+    kind: Literal["grids"] = "grids"
     resolutions: tuple[int, ...] = (16, 32, 64, 128)
     channels: int = 4
     width: int = 64
@@ -133,8 +131,6 @@ class NeuralRecipe:
     def numbers(self) -> int:
         """Approximate number of learned parameters."""
         shape = self.shape
-        if shape.kind == "networks":
-            return 1_000_000
         background = shape.channels * sum((n + 1) ** 3 for n in shape.background)
         return sum((1 + shape.channels) * (n + 2) ** 3 for n in shape.resolutions) + background
 

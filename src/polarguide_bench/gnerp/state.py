@@ -12,12 +12,9 @@ from polarguide.gaussians.gaussians import Adam
 from polarguide.geometry.camera import Camera
 from polarguide.training.checked import MOST_STEPS, TensorRule, check_tensors, moment_rules
 from polarguide.training.state import seeded
-from polarguide_bench.gnerp.field import Field, GridField, NetworkField, Region
+from polarguide_bench.gnerp.field import Field, Region
 from polarguide_bench.gnerp.recipe import NeuralRecipe
 
-KINDS: dict[str, type[Field]] = {"grids": GridField, "networks": NetworkField}
-# Settings of Adam. With a longer averaging of squared gradients, a node that no ray has reached for a thousand steps
-# would move too far at the next ray.
 BETAS = (0.9, 0.99)
 EPSILON = 1e-15
 
@@ -48,7 +45,7 @@ class FieldState:
         cls, step: int, recipe: NeuralRecipe, region: Region, seed: int, device: torch.device | str
     ) -> FieldState:
         """Create a state with the initial values of a field in a region."""
-        field = KINDS[recipe.shape.kind](region, recipe.shape, seeded(seed, 8)).to(device)
+        field = Field(region, recipe.shape, seeded(seed, 8)).to(device)
         rates = {name: 0.0 for name, _ in field.named_parameters()}
         return cls(step, field, Adam(rates, betas=BETAS, epsilon=EPSILON))
 

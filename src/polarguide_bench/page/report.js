@@ -169,26 +169,6 @@
     window.addEventListener("blur", release);
   }
 
-  function setUpCurves() {
-    for (const button of element("axis").children) {
-      button.onclick = () => {
-        for (const other of element("axis").children) {
-          other.setAttribute("aria-pressed", String(other === button));
-          for (const plot of document.querySelectorAll(".by-" + other.dataset.axis)) plot.hidden = other !== button;
-        }
-      };
-    }
-    for (const figure of document.querySelectorAll(".curves")) {
-      const lines = [...figure.querySelectorAll("polyline")];
-      const show = (name) => lines.forEach((line) =>
-        line.classList.toggle("dimmed", name !== null && line.dataset.name !== name));
-      for (const item of figure.querySelectorAll(".legend li")) {
-        item.onmouseenter = () => show(item.dataset.name);
-        item.onmouseleave = () => show(null);
-      }
-    }
-  }
-
   /* A choice of the columns of a section's tables, which have the same: a table is wider than many windows. */
   function setUpColumns() {
     for (const section of document.querySelectorAll("section")) {
@@ -214,7 +194,6 @@
     }
   }
 
-  setUpCurves();
   setUpColumns();
   if (views.length) {
     setUpChoices();

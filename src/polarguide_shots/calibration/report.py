@@ -6,15 +6,16 @@ import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
-import torch
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure, SubFigure
 from numpy.typing import NDArray
 
 from polarguide.capture.sensor.analyzers import AnalyzerCalibration
 from polarguide.capture.sensor.pattern import Pattern
 from polarguide.geometry.polarizer import ANGLES, stokes_of_four
-from polarguide.visualization.figures import FONT, INK, Picture, contact_sheet, scalar_to_rgb, scale_bar
+from polarguide.visualization.figures import Picture
 from polarguide_shots.calibration.shots import ShotFit
 
 COUNTLESS = 1000.0
@@ -115,14 +116,12 @@ _FORMS = {"throughput": "{:.3f}".format, "extinction": _ratio, "angle_error": "{
 """Functions that format the properties of a position for the table."""
 
 
-_CURVES = {0: (204, 51, 51), 45: (46, 134, 46), 90: (51, 102, 204), 135: (190, 120, 20)}
-_HEIGHT = 340
-_LEFT = 70
-_RIGHT = 30
-_TOP = 78
-_BOTTOM = 48
-_WIDTH = 1040
-_GRID = (222, 222, 222)
+_KINDS = {
+    "throughput": ("throughput", "viridis"),
+    "extinction": ("extinction ratio", "magma"),
+    "angle_error": ("angle error, degrees", "turbo"),
+}
+"""Label and color map of each property in the picture."""
 
 
 def calibration_picture(
@@ -141,121 +140,60 @@ def calibration_picture(
         means: means of the shots by position, [T, K].
         pattern: pattern of the region of the shots.
     """
-    parts = (_curves(calibration, analyzers, fit, means, pattern), _maps(analyzers))
-    width = max(part.shape[1] for part in parts)
-    return np.concatenate(
-        [np.pad(p, ((0, 0), (0, width - p.shape[1]), (0, 0)), constant_values=255) for p in parts]
-    )
-
-
-def _maps(analyzers: Sequence[Position]) -> Picture:
-    """Draw throughput, extinction ratio and angle error of each block.
-
-    The picture has a row for each angle, and three columns for each color.
-    """
-    colors = list(dict.fromkeys(position.color for position in analyzers))
-    kinds = (
-        ("throughput", "throughput", "viridis"),
-        ("extinction", "extinction ratio", "magma"),
-        ("angle_error", "angle error, degrees", "turbo"),
-    )
-    rows: list[list[Picture | None]] = [[] for _ in ANGLES]
-    labels = []
-    footer = []
-    for (name, title, colormap), color in itertools.product(kinds, colors):
-        low, high = _range(np.stack([getattr(p, name) for p in analyzers]), signed=name == "angle_error")
-        labels.append(title if color is None else f"{_COLORS[color]}: {title}")
-        footer.append(scale_bar(low, high, colormap))
-        # Positions of a color are in the order of the angles.
-        for row, position in zip(rows, (p for p in analyzers if p.color == color), strict=True):
-            row.append(scalar_to_rgb(torch.from_numpy(getattr(position, name).copy()), low, high, colormap))
-    return contact_sheet(
-        rows,
-        [f"{angle} deg" for angle in ANGLES],
-        labels,
-        footer=footer,
-        minimum_width=256,
-        maximum_width=420 if len(colors) == 1 else 256,
-    )
-
-
-def _range(values: Array, *, signed: bool) -> tuple[float, float]:
-    """Return the lowest and highest value of a color scale, rounded outward to two digits."""
-    low, high = (float(end) for end in np.percentile(values, [1, 99]))
-    if signed:
-        end = max(0.1, float(np.ceil(10 * max(abs(low), abs(high))) / 10))
-        return -end, end
-    step = 10.0 ** np.floor(np.log10(max(high - low, 1e-3 * high)))
-    low = float(np.floor(low / step) * step)
-    high = float(np.ceil(high / step) * step)
-    return (float(f"{low:.6g}"), float(f"{high:.6g}")) if high > low else (low, low + float(step))
-
-
-def _curves(
-    calibration: AnalyzerCalibration,
-    analyzers: Sequence[Position],
-    fit: ShotFit,
-    means: Array,
-    pattern: Pattern,
-) -> Picture:
-    """Draw the mean intensity behind each analyzer as a function of the polarizer's angle, with the fit."""
-    drawn: Picture = np.full((_HEIGHT, _WIDTH, 3), 255, np.uint8)
-    places = pattern.angles.ravel()
-    bottom = _HEIGHT - _BOTTOM
-    right = _WIDTH - _RIGHT - 330
-    degrees = np.linspace(0, 180, 181)
-    light = _polarized_light(np.radians(degrees))
-    curves = {a: light @ fit.vectors[places == a].mean(axis=0) for a in ANGLES}
-    readings = {a: means[:, places == a].mean(axis=1) / fit.levels for a in ANGLES}
-    top_value = max(float(curve.max()) for curve in curves.values()) * 1.05
-
-    def at(angle: float, value: float) -> tuple[int, int]:
-        return (
-            round(_LEFT + angle / 180 * (right - _LEFT)),
-            round(bottom - max(0.0, value) / top_value * (bottom - _TOP)),
-        )
-
-    for angle in range(0, 181, 45):
-        cv2.line(drawn, at(angle, 0), at(angle, top_value), _GRID, 1)
-        _text(drawn, f"{angle}", at(angle, 0)[0] - 10, bottom + 18)
-    for share in (0.0, 0.25, 0.5, 0.75):
-        value = share * top_value
-        cv2.line(drawn, at(0, value), at(180, value), _GRID, 1)
-        _text(drawn, f"{value:.2f}", 24, at(0, value)[1] + 4)
-    _text(
-        drawn,
-        "angle of the polarizer in degrees; share of full scale; dots are shots, curves the fit",
-        _LEFT + 40,
-        _HEIGHT - 10,
-    )
-    for angle in ANGLES:
-        points = np.array([at(*point) for point in zip(degrees, curves[angle], strict=True)], np.int32)
-        cv2.polylines(drawn, [points], False, _CURVES[angle], 1, cv2.LINE_AA)
-        for point in zip(np.degrees(fit.angles), readings[angle], strict=True):
-            cv2.circle(drawn, at(*point), 4, _CURVES[angle], -1, cv2.LINE_AA)
+    columns = len(_KINDS) * len(analyzers) // len(ANGLES)
+    figure = Figure(figsize=(2 + 2.6 * columns, 14), layout="constrained")
+    rows = figure.add_gridspec(2, 1, height_ratios=(1, 2.5))
+    top = figure.add_subfigure(rows[0])
+    bottom = figure.add_subfigure(rows[1])
     lens = f", {calibration.lens}" if calibration.lens else ""
     block = calibration.block
     blocks = "single pixels" if block == calibration.pattern.period else f"blocks of {block} pixels"
     size = f"{calibration.size[0]}x{calibration.size[1]} pixels"
-    _text(drawn, f"{calibration.sensor}{lens}: {size}, {blocks}", 12, 26, 0.6)
-    _text(drawn, f"{len(means)} shots, misfit {fit.misfit:.2%} of their mean", 12, 50)
-    _legend(drawn, analyzers, right + 24)
-    return drawn
+    top.suptitle(
+        f"{calibration.sensor}{lens}: {size}, {blocks}\n{len(means)} shots, misfit {fit.misfit:.2%} of their mean",
+        parse_math=False,
+    )
+    _draw_curves(top.subplots(), fit, means, pattern)
+    _draw_maps(bottom, analyzers)
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
 
-def _legend(drawn: Picture, analyzers: Sequence[Position], x: int) -> None:
-    """Draw a legend with the median properties of the analyzers."""
-    columns = (90, 168, 242)
-    for text, place in zip(_FORMS, columns, strict=True):
-        _text(drawn, text.replace("_", " "), x + place - 4, 50, 0.4)
-    for line, position in enumerate(analyzers):
-        y = _TOP + line * (26 if len(analyzers) == len(ANGLES) else 20)
-        cv2.circle(drawn, (x + 6, y - 4), 5, _CURVES[position.angle], -1, cv2.LINE_AA)
-        _text(drawn, f"{position.name} deg", x + 18, y)
-        for (name, form), place in zip(_FORMS.items(), columns, strict=True):
-            _text(drawn, form(np.median(getattr(position, name))), x + place, y)
+def _draw_curves(axes: Axes, fit: ShotFit, means: Array, pattern: Pattern) -> None:
+    """Draw the mean intensity behind each analyzer as a function of the polarizer's angle, with the fit."""
+    places = pattern.angles.ravel()
+    degrees = np.linspace(0, 180, 181)
+    light = _polarized_light(np.radians(degrees))
+    for angle in ANGLES:
+        (line,) = axes.plot(degrees, light @ fit.vectors[places == angle].mean(axis=0), label=f"{angle} deg")
+        readings = means[:, places == angle].mean(axis=1) / fit.levels
+        axes.plot(np.degrees(fit.angles), readings, "o", color=line.get_color())
+    axes.set(
+        xlabel="angle of the polarizer in degrees", ylabel="share of full scale", xticks=range(0, 181, 45)
+    )
+    axes.set_title("dots: shots, curves: fit", fontsize="medium")
+    axes.grid(linewidth=0.3)
+    axes.legend()
 
 
-def _text(drawn: Picture, text: str, x: int, y: int, scale: float = 0.45) -> None:
-    ascii_text = text.encode("ascii", "replace").decode()
-    cv2.putText(drawn, ascii_text, (x, y), FONT, scale, INK, 1, cv2.LINE_AA)
+def _draw_maps(figure: SubFigure, analyzers: Sequence[Position]) -> None:
+    """Draw the properties of each block, with a row for each angle and three columns for each color."""
+    colors = list(dict.fromkeys(position.color for position in analyzers))
+    grid = figure.subplots(len(ANGLES), len(_KINDS) * len(colors), squeeze=False)
+    for column, (name, color) in enumerate(itertools.product(_KINDS, colors)):
+        title, colormap = _KINDS[name]
+        low, high = np.percentile(np.stack([getattr(p, name) for p in analyzers]), [1, 99])
+        if name == "angle_error":
+            high = max(-low, high)
+            low = -high
+        # Positions of a color are in the order of the angles.
+        drawn = (position for position in analyzers if position.color == color)
+        for axes, position in zip(grid[:, column], drawn, strict=True):
+            values = getattr(position, name)
+            image = axes.imshow(values, vmin=low, vmax=high, cmap=colormap)
+            axes.set_title(
+                f"{position.name} deg, median {_FORMS[name](np.median(values))}", fontsize="medium"
+            )
+            axes.set_axis_off()
+        figure.colorbar(image, ax=list(grid[:, column]), location="bottom", label=title)

@@ -9,7 +9,7 @@ from small_fields import SMALL_SAMPLING, SMALL_SHAPE
 from textured_ball import DISTANCE, cameras
 from torch.autograd import gradcheck
 
-from polarguide_bench.gnerp.field import MARGIN, Field, GridField, NetworkField, Region
+from polarguide_bench.gnerp.field import MARGIN, Field, Region
 from polarguide_bench.gnerp.grids import (
     FeatureGrids,
     SmoothGrids,
@@ -27,7 +27,7 @@ FINE = Sampling(coarse=64, fine=64, background=4)
 
 def grid_field(spread: float = 0.01) -> Field:
     shape = FieldShape(resolutions=(8, 16), channels=2, width=16, background=(8,), first_spread=spread)
-    return GridField(REGION, shape, torch.Generator().manual_seed(3))
+    return Field(REGION, shape, torch.Generator().manual_seed(3))
 
 
 def rays(offsets: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -107,28 +107,9 @@ def test_the_map_has_the_distances() -> None:
         assert float(lattice[-1, -1, -1]) == pytest.approx(float(field.geometry(corner).distance), abs=1e-5)
 
 
-def test_the_published_networks_start_as_the_sphere(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(NetworkField, "map_side", 5)
-    field = NetworkField(REGION, FieldShape(kind="networks"), torch.Generator().manual_seed(5))
-    generator = torch.Generator().manual_seed(6)
-    outward = torch.nn.functional.normalize(torch.randn(400, 3, generator=generator), dim=1)
-    places = 2 * outward * torch.rand(400, 1, generator=generator)
-    seen = field.geometry(places)
-    error = (seen.distance.detach() - (places.norm(dim=1) - RADIUS)).abs()
-    assert float(error.mean()) < 0.35  # of a radius of 1.25; the initialization holds on the average alone
-    cosine = torch.nn.functional.cosine_similarity(seen.slope.detach(), places)
-    assert float(cosine.median()) > 0.95
-    color = field.color(places, places, seen.slope, seen.features)
-    (color.mean() + seen.slope.norm(dim=1).mean()).backward()
-    gradient = field.layers[0].weight.grad
-    assert bool(gradient.isfinite().all())
-    assert float(gradient.abs().max()) > 0
-
-
 def test_a_shape_of_its_own_is_kept_small() -> None:
     assert (
-        sum(values.numel() for values in GridField(REGION, SMALL_SHAPE, torch.Generator()).parameters())
-        < 30_000
+        sum(values.numel() for values in Field(REGION, SMALL_SHAPE, torch.Generator()).parameters()) < 30_000
     )
 
 

@@ -23,11 +23,10 @@ from polarguide.runs import memory_plan
 from polarguide.runs.callbacks import TrainingStopped
 from polarguide.runs.folder import CHECKPOINT, save_checkpoint
 from polarguide.training.settings import TrainSettings
-from polarguide_bench.gnerp.field import NetworkField
 from polarguide_bench.gnerp.loop import FieldLoop, aolp_loss, color_loss, eikonal_loss, guidance_loss
 from polarguide_bench.gnerp.march import _strata
 from polarguide_bench.gnerp.model import FieldModel
-from polarguide_bench.gnerp.recipe import FieldShape, NeuralRecipe, Sampling
+from polarguide_bench.gnerp.recipe import NeuralRecipe, Sampling
 from polarguide_bench.gnerp.runs import (
     FieldRun,
     load_field,
@@ -113,8 +112,7 @@ def test_resumed_is_uninterrupted(ball: Scene, tmp_path: Path) -> None:
     assert bits(parts.state) == bits(whole.state)
 
 
-def test_all_recipes_take_a_step(ball: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(NetworkField, "map_side", 5)
+def test_all_recipes_take_a_step(ball: Scene) -> None:
     for recipe in (RECIPE_GNERP, *ABLATIONS_GNERP):
         made = trainer(ball, 2, replace(recipe, sampling=replace(recipe.sampling, rays=8, fine=4)))
         reports = [made.step(), made.step()]
@@ -266,12 +264,6 @@ def test_strata_are_even_and_apart() -> None:
     torch.testing.assert_close(middle[0], torch.tensor([0.125, 0.375, 0.625, 0.875]))
     drawn = _strata(50, 4, torch.zeros(1), torch.Generator().manual_seed(0))
     assert bool(((drawn * 4).floor() == torch.arange(4)).all())
-
-
-def test_published_sizes() -> None:
-    published = ABLATIONS_GNERP[1]
-    assert published.shape == FieldShape(kind="networks")
-    assert (published.sampling.rays, published.sampling.coarse, published.sampling.fine) == (512, 64, 128)
 
 
 GENERATOR = torch.Generator().manual_seed(2)
