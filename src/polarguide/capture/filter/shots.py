@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -42,6 +43,11 @@ from polarguide.core.text import canonical, listed
 SHOT_SUFFIXES = (*SUFFIXES, *CAMERA_RAW)
 Candidates = dict[str, dict[int, list[Path]]]
 """Files of each shot by view and angle. There are several files of a shot if names are ambiguous."""
+_SUFFIX = re.compile(
+    r"(?P<view>.+?)[-_ .]+(?:i|pol|angle)?[-_ ]?(?<![_ .]-)(?P<angle>0{1,3}|0?45|0?90|135)(?:deg)?",
+    re.IGNORECASE,
+)
+_BARE = re.compile(r"(?:(?:i|pol|angle)[-_ ]?|[_ ])?(?P<angle>0{1,3}|0?45|0?90|135)(?:deg)?", re.IGNORECASE)
 # Compression spreads the values at the edge of clipped areas over a few 8-bit values.
 _LOSSY_FULL = 250 / 255
 # Smallest memory in bytes per pixel of four shots, decoded and stacked.
@@ -149,11 +155,14 @@ def group_files(files: Sequence[Path]) -> tuple[Candidates, list[Path]]:
     others: list[Path] = []
     for folder in dict.fromkeys(path.parent for path in files):
         inside = [path for path in files if path.parent == folder]
-        for path, name in zip(inside, views_of_names(folder, inside), strict=True):
-            if name is None or name[1] not in ANGLES:
+        alone = all(_BARE.fullmatch(shot_stem(path)) for path in inside)
+        for path in inside:
+            match = (_BARE if alone else _SUFFIX).fullmatch(shot_stem(path))
+            if match is None:
                 others.append(path)
-            else:
-                shots.setdefault(name[0], {}).setdefault(ANGLES[ANGLES.index(name[1])], []).append(path)
+                continue
+            view = canonical(folder.resolve().name) if alone else match["view"]
+            shots.setdefault(view, {}).setdefault(int(match["angle"]), []).append(path)
     return {view: dict(sorted(by_angle.items())) for view, by_angle in shots.items()}, others
 
 
