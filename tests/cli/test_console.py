@@ -216,7 +216,7 @@ ELSEWHERE = {
     *(
         (verb, name)
         for verb in ("compare", "ablate")
-        for name in ("seed", "views_per_step", "gaussians", "begin_again", "materials")
+        for name in ("seed", "gaussians", "begin_again", "materials")
     ),
     ("train", "begin_again"),
     ("prepare", "calibration"),

@@ -316,7 +316,7 @@ class _Row(msgspec.Struct):
 _ROWS = msgspec.json.Decoder(_Row)
 
 
-OPEN = ("steps", "refractive_index", "views_per_step", "background")
+OPEN = ("steps", "refractive_index", "background")
 """Settings that ``resolve`` completes if they are not specified.
 
 The number of Gaussians is not listed, because it is needed before pictures are read.
@@ -373,7 +373,6 @@ def resolve(
         **vars(settings),
         "steps": _steps(sizes),
         "refractive_index": index_of(None, scene.refractive_index),
-        "views_per_step": 1,
         **recorded,
         "gaussians": most_gaussians(sum(sizes), method, settings, resumed),
         **settings.specified(),
