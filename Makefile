@@ -9,7 +9,8 @@
 # make sanitize    the kernels' tests with AddressSanitizer and UndefinedBehaviorSanitizer, the thread pool with ThreadSanitizer
 # make speed   where the time of a training step goes, for 1, 2, 4 ... threads; SCENE=a scene or a run, in place of the demo
 # make wheel   build the wheel for this system, install it where there is no compiler, and run the demo there, into dist/
-# make docs    build the documentation into build/docs; a warning is an error
+# make docs    build the documentation into build/docs; a warning is an error, and so is a page that loads files of another host
+# make site    the same as a web site with the gallery; .github/workflows/site.yml publishes it
 # make cross-check    compile the kernels for aarch64 (needs aarch64-linux-gnu-g++ and cmake)
 # make gpu-check    build, test and measure on a machine with a GPU; in parts: call it again until it says complete
 # make gpu-pack SCENE=.../spheres    what gpu-check needs on a machine without a network, into gpu-pack/
@@ -31,7 +32,7 @@ PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check 
 SOURCES := pyproject.toml constraints-cpu.txt CMakeLists.txt README.md LICENSE \
 	$(shell find native src -name __pycache__ -prune -o -name '*.so' -o -print)
 
-.PHONY: demo dataset test test-kernels fuzz soak sanitize speed wheel docs cross-check gpu-check gpu-pack clean
+.PHONY: demo dataset test test-kernels fuzz soak sanitize speed wheel docs site cross-check gpu-check gpu-pack clean
 .DELETE_ON_ERROR:
 MAKEFLAGS += --no-print-directory
 
@@ -86,6 +87,9 @@ $(READERS):
 docs: $(VENV)/.installed-docs
 	$(BIN)/python -m sphinx -W --keep-going -n -q -j auto -d build/doctrees docs build/docs
 	@echo "The documentation starts at build/docs/index.html"
+
+# The files of the gallery are in docs/_static/scenes: a fork needs no training.
+site: docs
 
 cross-check: $(VENV)/.installed-test
 	$(BIN)/python -m pytest tests/native/test_cross_compilation.py

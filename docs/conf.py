@@ -20,6 +20,8 @@ extensions = [
     "formulas",
     "plain_docstrings",
     "generated_pages",
+    "offline",
+    "sphinx.ext.githubpages",  # for hosts that would leave out folders such as _static
 ]
 exclude_patterns = ["_extensions", "generated"]
 suppress_warnings = ["config.cache"]
@@ -64,6 +66,7 @@ html_theme = "furo"
 html_title = f"polarguide {release}"
 html_static_path = ["_static"]
 html_css_files = ["polarguide.css"]
+html_js_files = [("wipes.js", {"defer": "defer"})]
 html_copy_source = False
 html_show_sourcelink = False
 copybutton_prompt_text = r">>> |\.\.\. |\$ "

@@ -64,7 +64,7 @@ def main() -> None:
     options = parser.parse_args()
     layout = find_layout(options.capture)
     rng = np.random.default_rng(0)
-    found: dict[tuple[str, str, bool], list[tuple[float, float, float]]] = {}
+    found: dict[tuple[str, bool], list[tuple[float, float, float]]] = {}
     for view in layout.names[:: options.every]:
         light = linear_intensities(layout, view, "linear")
         _, height, width, _ = light.shape
@@ -73,18 +73,14 @@ def main() -> None:
             pattern = sensor_pattern(sensor)
             values = seen(light, pattern, rng)
             target = true if pattern.colors is not None else np.repeat(true[..., 1:2], 3, axis=3)
-            for interpolation in ("bilinear", "guided"):
-                for registered in (False, True):
-                    picture = demosaic(
-                        values, np.zeros(values.shape, bool), pattern,
-                        mode="half", interpolation=interpolation, registered=registered,
-                    )  # fmt: skip
-                    key = (sensor, interpolation, registered)
-                    found.setdefault(key, []).append(errors(picture.intensities, target))
-    for (sensor, interpolation, registered), rows in found.items():
+            for registered in (False, True):
+                bad = np.zeros(values.shape, bool)
+                picture = demosaic(values, bad, pattern, mode="half", registered=registered)
+                found.setdefault((sensor, registered), []).append(errors(picture.intensities, target))
+    for (sensor, registered), rows in found.items():
         dolp, aolp, psnr = np.mean(rows, axis=0)
         kind = "registered" if registered else "as they lie"
-        print(f"{sensor} {interpolation:8} {kind:11} DoLP {dolp:.3f}  AoLP {aolp:4.1f}  S0 {psnr:.1f} dB")
+        print(f"{sensor} {kind:11} DoLP {dolp:.3f}  AoLP {aolp:4.1f}  S0 {psnr:.1f} dB")
 
 
 if __name__ == "__main__":

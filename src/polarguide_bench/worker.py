@@ -107,7 +107,7 @@ def _inspect(task: Processing, scene: Path, folder: Path) -> dict[str, Any]:
     settings = InspectSettings(
         refractive_index=task.request.settings.refractive_index, transfer=task.request.reading.transfer
     )
-    inspected = inspect_scene(scene, out, settings, choose_backend(task.compute.device))
+    inspected = inspect_scene(scene, settings, choose_backend(task.compute.device))
     write_inspection(inspected, out)
     findings = tuple(
         f"{check.verdict}: {check.title}: {check.finding}"

@@ -234,8 +234,7 @@ def interpolation_factors(sensor: str, x: int, y: int, mode: str) -> tuple[NDArr
     """Compute how much noise demosaicing leaves in the developed intensities.
 
     Interpolated values are means of samples and have less noise. The weights of the samples are the responses of the
-    demosaicing to an impulse at each position of the pattern. Guided interpolation, which is not linear, is treated as
-    bilinear. Luminance is the mean of the colors.
+    demosaicing to an impulse at each position of the pattern. Luminance is the mean of the colors.
 
     Args:
         sensor: name of the sensor.
@@ -261,9 +260,7 @@ def interpolation_factors(sensor: str, x: int, y: int, mode: str) -> tuple[NDArr
     for row, column in np.ndindex(cell, cell):
         picture = np.zeros((side, side), np.float32)
         picture[row::_REACH, column::_REACH] = 1
-        developed = demosaic(
-            picture, np.zeros(picture.shape, bool), pattern, mode=way, interpolation="bilinear", colored=False
-        )
+        developed = demosaic(picture, np.zeros(picture.shape, bool), pattern, mode=way, colored=False)
         response = developed.intensities.mean(axis=-1, dtype=np.float64)
         if mode == "half":
             response = response.reshape(len(ANGLES), side // 2, 2, side // 2, 2).mean(axis=(2, 4))

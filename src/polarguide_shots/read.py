@@ -511,10 +511,9 @@ def develop_mosaic(shot: ExposureSet, options: ShotOptions, part: Part | None) -
     levels = replace(levels, gamma=options.gamma)
     assert options.sensor is not None
     require_kind(options.sensor, sample_blocks(values, SIDE), levels)
-    ratio, _ = files.light_of_blocks([sample_blocks(values, 2 * pattern.period)], levels, dark, values.shape)
+    ratio = files.ratio_of_blocks([sample_blocks(values, 2 * pattern.period)], levels, dark, values.shape)
     gains, gain_notes = pair_gains(ratio, options, _GAINS, calibrated=files.analyzers is not None)
     mode = options.demosaic
-    way = options.interpolation
     step = DEMOSAIC_MODES[mode]
     x, y = files.corner
     cut = _cut(part, values.shape, step)
@@ -539,15 +538,15 @@ def develop_mosaic(shot: ExposureSet, options: ShotOptions, part: Part | None) -
         bad = saturated | black | defective
         good = ~(bad[::2, ::2] | bad[1::2, ::2] | bad[::2, 1::2] | bad[1::2, 1::2])
         noise = estimated_noise([cells[angle] for angle in ANGLES], good, lsb)
-    picture = demosaic(linear, saturated, pattern, mode=mode, interpolation=way, colored=False)
+    picture = demosaic(linear, saturated, pattern, mode=mode, colored=False)
     factors, mean_variance = interpolation_factors(options.sensor, x, y, mode)
     # A rotation that is not a permutation mixes all four angles.
     mixed = np.broadcast_to(factors.mean(axis=0), factors.shape)
     return Developed(
         intensities=oriented(picture.intensities, options.calibration),
-        dark=spoiled(black, pattern, mode=mode, interpolation=way),
+        dark=spoiled(black, pattern, mode=mode),
         saturated=picture.invalid,
-        masked=spoiled(defective, pattern, mode=mode, interpolation=way),
+        masked=spoiled(defective, pattern, mode=mode),
         noise=noise,
         factors=oriented(factors, options.calibration) if options.calibration.permutes else mixed,
         mean_variance=mean_variance,

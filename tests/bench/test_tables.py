@@ -217,7 +217,7 @@ def test_frames_are_the_csv_files(tmp_path: Path) -> None:
         "rock": part(None, psnr=1.0),
     }
     runs = [seen("x, y", "r", s, **parts) for s in (0, 1)]
-    runs += [run("x, y", FREE, s, psnr=28.0, haze_alpha=0.125 + s / 8) for s in (0, 1)]
+    runs += [run("x, y", FREE, s, psnr=28.0, haze_true=0.125 + s / 8) for s in (0, 1)]
     found = results([*runs, run("z", "r", 0, psnr=1.0)])
     write_tables(tmp_path, found)
     scores = pd.read_csv(tmp_path / "results.csv")
@@ -230,8 +230,8 @@ def test_frames_are_the_csv_files(tmp_path: Path) -> None:
         c.key for c in COLUMNS if c.unit == "%" and c.factor == 100
     }
     free = scores.set_index(["scene", "recipe"]).loc[("x, y", FREE)]
-    assert free["haze_alpha_percent"] == 18.75
-    assert free["haze_alpha_percent_spread"] == pytest.approx(12.5 / 2**0.5)
+    assert free["haze_true_percent"] == 18.75
+    assert free["haze_true_percent_spread"] == pytest.approx(12.5 / 2**0.5)
     differences = pd.read_csv(tmp_path / "differences.csv")
     assert differences["mean"].tolist() == found.differences["mean"].tolist()
     parts = pd.read_csv(tmp_path / "parts.csv").set_index("name")

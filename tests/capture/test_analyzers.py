@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import struct
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +19,6 @@ from polarguide.capture.sensor.analyzers import (
     write_analyzers,
 )
 from polarguide.capture.sensor.pattern import sensor_pattern, tiled
-from polarguide.geometry.polarizer import ANGLES
 
 SENSORS = ("IMX250MZR", "IMX250MYR")
 LIGHT = np.array([0.8, 0.05, -0.06])
@@ -32,12 +30,6 @@ def ideal_mosaic(sensor: MadeSensor, stokes: np.ndarray) -> np.ndarray:
     seen = (s0 + s1 * np.cos(2 * sensor.nominal) + s2 * np.sin(2 * sensor.nominal)) / 2
     colors = sensor_pattern(sensor.name).colors
     return seen if colors is None else seen * tiled(COLORS[colors], seen.shape)
-
-
-def four(mosaic: np.ndarray, sensor: MadeSensor) -> np.ndarray:
-    """The samples of the cells by angle, [4, H / 2, W / 2]."""
-    places = {round(np.degrees(sensor.nominal[y, x])): (y, x) for y in range(2) for x in range(2)}
-    return np.stack([mosaic[places[a][0] :: 2, places[a][1] :: 2] for a in ANGLES])
 
 
 @pytest.mark.parametrize("name", SENSORS)
@@ -81,38 +73,6 @@ def test_a_region_of_the_calibration_is_enough(name: str, offset: tuple[int, int
     np.testing.assert_allclose(found[top:end_y, left:end_x], expected[top:end_y, left:end_x], atol=2e-6)
     if left:  # a column that fills no cell stays as it was
         np.testing.assert_array_equal(found[:, 0], seen[:, 0])
-
-
-def test_four_intensities_at_every_size_get_the_same_correction() -> None:
-    sensor = made_sensor("IMX250MZR", (24, 32), single=True)
-    calibration = true_calibration(sensor)
-    seen, expected = (four(m, sensor) for m in (sensor.sees(LIGHT), ideal_mosaic(sensor, LIGHT)))
-    np.testing.assert_allclose(calibration.apply(seen), expected, atol=2e-6)
-    three = np.repeat(seen[..., None], 3, axis=-1)
-    np.testing.assert_allclose(
-        calibration.apply(three), np.repeat(expected[..., None], 3, axis=-1), atol=2e-6
-    )
-    np.testing.assert_allclose(calibration.apply(seen[..., None]), expected[..., None], atol=2e-6)
-    doubled = np.repeat(np.repeat(seen, 2, axis=1), 2, axis=2)
-    np.testing.assert_allclose(calibration.apply(doubled)[:, ::2, ::2], expected, atol=2e-6)
-    quarter = calibration.apply(seen.reshape(4, 6, 2, 8, 2).mean(axis=(2, 4)))
-    before = np.abs(seen.reshape(4, 6, 2, 8, 2).mean(axis=(2, 4)) - expected[:, ::2, ::2]).mean()
-    assert np.abs(quarter - expected[:, ::2, ::2]).mean() < before / 10
-
-
-def test_colors_have_analyzers_of_their_own() -> None:
-    sensor = made_sensor("IMX250MYR", (32, 32), seed=3)
-    calibration = true_calibration(sensor)
-    cells, ideal = (four(m, sensor) for m in (sensor.sees(LIGHT), ideal_mosaic(sensor, LIGHT)))
-
-    def superpixels(by_angle: np.ndarray) -> np.ndarray:
-        green = (by_angle[:, ::2, 1::2] + by_angle[:, 1::2, ::2]) / 2
-        return np.stack([by_angle[:, ::2, ::2], green, by_angle[:, 1::2, 1::2]], axis=-1)
-
-    found = calibration.apply(superpixels(cells))
-    # The two greens of a superpixel have one matrix, the mean of theirs.
-    np.testing.assert_allclose(found[..., [0, 2]], superpixels(ideal)[..., [0, 2]], atol=2e-6)
-    np.testing.assert_allclose(found[..., 1], superpixels(ideal)[..., 1], atol=4e-4)
 
 
 def test_the_peak_bounds_what_comes_out() -> None:
@@ -189,48 +149,12 @@ def test_a_file_that_is_damaged_is_refused_with_one_line(saved: Path, how: str) 
     assert expected in str(error)
 
 
-def test_a_file_with_its_checksum_that_makes_no_sense_is_refused(tmp_path: Path) -> None:
-    good = true_calibration(made_sensor("IMX250MZR", (24, 32)))
-    alike = np.broadcast_to(good.vectors[:, :, :1, :1], good.vectors.shape)
-    for vectors in (good.vectors * np.nan, good.vectors * [1, 0, 0], good.vectors[:2], alike):
-        bad = AnalyzerCalibration("IMX250MZR", "", (0, 0), (32, 24), 2, vectors.astype(np.float32), "mean")
-        write_analyzers(tmp_path / "bad.safetensors", bad)
-        Fault("bad.safetensors", expected="a file that polarguide calibrate").raised_by(
-            read_analyzers, tmp_path / "bad.safetensors"
-        )
-
-
-@pytest.mark.parametrize("name", SENSORS)
-@pytest.mark.parametrize(
-    ("factor", "turned", "fault"),
-    [
-        (1e30, False, Fault(found="throughputs of")),
-        (1e-30, False, Fault(found="throughputs of")),
-        (1, True, Fault(found="far from the sensor's angles")),
-    ],
-)
-def test_vectors_that_no_sensor_has_are_refused(
-    tmp_path: Path, name: str, factor: float, turned: bool, fault: Fault
-) -> None:
-    calibration = true_calibration(made_sensor(name, (16, 24)))
-    vectors = calibration.vectors * np.float32(factor)
-    if turned:  # every polarizer as the first one of its block
-        vectors[:] = vectors[:, :, :1, :1]
-    write_analyzers(tmp_path / "a.safetensors", replace(calibration, vectors=vectors))
-    fault.raised_by(read_analyzers, tmp_path / "a.safetensors")
-
-
 def test_other_sizes_and_sensors_are_refused(saved: Path) -> None:
     calibration = read_analyzers(saved)
     Fault(expected="a calibration that covers 64x48 pixels", found="the calibration of 32x24").raised_by(
         calibration.apply, np.zeros((48, 64), np.float32)
     )
-    Fault(found="the calibration of 32x24 pixels").raised_by(
-        calibration.apply, np.zeros((4, 13, 16), np.float32)
-    )
     Fault(expected="column 20").raised_by(calibration.apply, np.zeros((24, 16), np.float32), offset=(20, 0))
     Fault(expected="a calibration of the sensor IMX250MYR", found="the calibration of IMX250MZR").raised_by(
         calibration.require_sensor, "IMX250MYR", saved
     )
-    with pytest.raises(ValueError, match="expected"):
-        calibration.apply(np.zeros((3, 24, 32), np.float32))

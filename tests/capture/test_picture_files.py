@@ -443,30 +443,21 @@ def test_heic_is_read_as_stored_with_its_turn_and_its_exposure(tmp_path: Path, b
 
 
 def test_heic_that_is_not_read_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    # A header alone, so that this needs no package: one picture of 64x48 that is turned, and an empty codec.
-    def box(kind: bytes, *parts: bytes) -> bytes:
-        body = b"".join(parts)
-        return struct.pack(">I", 8 + len(body)) + kind + body
-
-    whole, size = b"\0" * 4, struct.pack(">4xII", 64, 48)
-
-    def file(*properties: bytes, brand: bytes = b"heic") -> bytes:
-        numbers = bytes(range(1, len(properties) + 1))
-        own = whole + struct.pack(">IHB", 1, 1, len(numbers)) + numbers
-        iprp = box(b"iprp", box(b"ipco", *properties), box(b"ipma", own))
-        return box(b"ftyp", brand, whole) + box(b"meta", whole, box(b"pitm", whole, b"\0\1"), iprp)
-
-    ispe, turned = box(b"ispe", size), box(b"irot", b"\3")
-    assert (declared_size(file(ispe, turned)), orientation(file(ispe, turned))) == ((64, 48), 6)
-    monkeypatch.setitem(sys.modules, "pillow_heif", None)
+    whole = heic(np.full((48, 64, 3), 0.5), 8, 6)
+    turned = b"\0\0\0\x09irot\3"
+    assert whole.count(turned) == 1
     for data, part in (
-        (file(ispe, turned), "not installed"),
-        (file(ispe, box(b"imir", b"\0")), "mirrored for display"),
-        (file(turned), "without a size"),
-        (file(ispe)[:-1], "cut short"),
-        (file(ispe, brand=b"avif"), "AVIF"),
+        (whole[:-1], "cut short"),
+        (whole[: len(whole) // 2], "cut short"),
+        (whole[:100], "cut short"),
+        (whole.replace(b"irot", b"imir"), "mirrored for display"),
+        (whole + turned.replace(b"\3", b"\1"), "rotated differently"),
+        (whole.replace(b"ftypheix", b"ftypavif"), "AVIF"),
     ):
         Fault(found=part).raised_by(decode_picture, tmp_path / "a.heic", data)
+    monkeypatch.setitem(sys.modules, "pillow_heif", None)
+    assert (declared_size(whole), orientation(whole)) == (None, 6)
+    Fault(found="not installed").raised_by(decode_picture, tmp_path / "a.heic", whole)
 
 
 def test_heic_of_high_dynamic_range_is_refused(tmp_path: Path) -> None:

@@ -36,7 +36,6 @@ from polarguide_shots.ring_scale import BAND, place, ring_scale
 from polarguide_synth.sensor import FilterShot, Sensor, behind_filter, exif_tags, filter_jpeg
 
 PLAIN = PrepareSettings(poses="none", gains="none", align=False)
-UNIT = (1.0, 1.0, 1.0)
 
 
 def write_shots(folder: Path, light: np.ndarray, *, orientation: int = 1) -> None:
@@ -71,14 +70,14 @@ def test_dark_shots_are_not_brightened(tmp_path: Path) -> None:
     assert dark / bright == pytest.approx(0.2 / 0.9, rel=0.01)
 
 
-def test_white_balance_and_saturation(tmp_path: Path) -> None:
+def test_saturation(tmp_path: Path) -> None:
     light = smooth_light(64, 96)
     light[:, 20:26, 30:36] *= 3
     write_shots(tmp_path / "in", light)
-    prepare_scene(tmp_path / "in", tmp_path / "out", replace(PLAIN, white_balance="1,1.25,1.6"))
+    prepare_scene(tmp_path / "in", tmp_path / "out", PLAIN)
     polar, invalid = read_polar(tmp_path / "out", "cup"), read_invalid(tmp_path / "out", "cup")
     assert invalid[21:25, 31:35].all()
-    expected = behind(light) * [1, 1.25, 1.6]
+    expected = behind(light)
     inside = ~invalid
     inside[:2] = inside[-2:] = inside[:, :2] = inside[:, -2:] = inside[18:28, 28:38] = False
     np.testing.assert_allclose(polar[:, inside], expected[:, inside], atol=4e-3)
@@ -90,7 +89,7 @@ def test_a_sensor_that_clips_is_at_full_scale(tmp_path: Path) -> None:
     from raw_photographs import write_dng
 
     write_dng(tmp_path / "a.dng", np.full((32, 48, 3), 1.5), black=0)
-    assert (read_camera_raw(tmp_path / "a.dng", UNIT)[0] == 65535).all()
+    assert (read_camera_raw(tmp_path / "a.dng")[0] == 65535).all()
 
 
 @pytest.mark.parametrize("black", [0, 528])
@@ -101,7 +100,7 @@ def test_linear_dng_clips_at_full_scale(tmp_path: Path, black: int) -> None:
 
     light = np.linspace(0, 1.2, 48 * 64 * 3).reshape(48, 64, 3)
     write_linear_dng(tmp_path / "a.dng", light, black=black)
-    pixels, _ = read_camera_raw(tmp_path / "a.dng", UNIT)
+    pixels, _ = read_camera_raw(tmp_path / "a.dng")
     np.testing.assert_allclose(pixels / 65535, np.minimum(light, 1), atol=2e-4)
     assert (pixels[light > 1.001] == 65535).all()
 
@@ -147,9 +146,7 @@ def test_damaged_files(tmp_path: Path, change: object, fault: Fault) -> None:
 def test_without_the_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "a.nef").write_bytes(b"raw")
     monkeypatch.setitem(sys.modules, "rawpy", None)
-    Fault(found="not installed", remedy="Install it with").raised_by(
-        read_camera_raw, tmp_path / "a.nef", UNIT
-    )
+    Fault(found="not installed", remedy="Install it with").raised_by(read_camera_raw, tmp_path / "a.nef")
 
 
 class Recorder:
@@ -182,22 +179,13 @@ def test_what_libraw_is_asked_for(tmp_path: Path, flip: int, code: int) -> None:
         seen.append(Recorder(flip))
         return seen[-1]
 
-    pixels, found = read_camera_raw(tmp_path / "a.nef", (2.0, 1.0, 1.5), opener=opener)
+    pixels, found = read_camera_raw(tmp_path / "a.nef", opener=opener)
     assert (pixels.shape, found) == ((4, 6, 3), code)
     asked = seen[0].asked
     assert (asked["gamma"], asked["output_bps"]) == ((1.0, 1.0), 16)
     assert asked["no_auto_bright"] is True
-    assert (asked["adjust_maximum_thr"], asked["user_wb"]) == (0.0, [2.0, 1.0, 1.5, 1.0])
+    assert (asked["adjust_maximum_thr"], asked["user_wb"]) == (0.0, [1.0, 1.0, 1.0, 1.0])
     assert (asked["use_camera_wb"], asked["use_auto_wb"], asked["user_flip"]) == (False, False, 0)
-
-
-def test_white_balance_is_for_camera_raw(tmp_path: Path) -> None:
-    from camera_files import write_shots as write_pictures
-
-    write_pictures(tmp_path / "in", "v", behind(smooth_light()))
-    Fault("--white-balance", expected="none for pictures").raised_by(
-        prepare_scene, tmp_path / "in", tmp_path / "out", replace(PLAIN, white_balance="1,2,3")
-    )
 
 
 @pytest.mark.parametrize(

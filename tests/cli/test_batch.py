@@ -36,7 +36,7 @@ HEAD = "name,path,sensor,options\n"
         (HEAD + "cup,a,,--stepz 3\n", Fault("line 2", "prepare and train", "--stepz")),
         (HEAD + 'cup,a,,"--steps ""3"\n', Fault("line 2", "command line")),
         (HEAD + "cup,a,,--steps 0\n", Fault("line 2), steps", "1 or more", "0")),
-        (HEAD + "cup,a,,--white-balance red\n", Fault("line 2), --white-balance", found="red")),
+        (HEAD + "cup,a,,--intrinsics red\n", Fault("line 2), --intrinsics", found="red")),
     ],
 )
 def test_a_wrong_table_is_refused_before_anything_is_written(tmp_path: Path, text: str, fault: Fault) -> None:

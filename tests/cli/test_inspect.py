@@ -1,4 +1,4 @@
-"""``polarguide inspect`` from the command line: page, record, --fix, and wrong input."""
+"""``polarguide inspect`` from the command line: page, record, and wrong input."""
 
 import json
 import re
@@ -7,7 +7,6 @@ from html.parser import HTMLParser
 from pathlib import Path
 
 import pytest
-from single_shots import single_shots
 
 from polarguide.cli.app import run
 from polarguide.inspection.report import LAYERS
@@ -98,35 +97,3 @@ def test_a_capture_with_poses_and_points_alone(whole_demo: Path, tmp_path: Path)
     assert record["angles"]["sources"][0]["usable"] is True
     assert verdicts["coverage"] == "ok"
     assert record["scene"]["posed_views"] == 50
-    assert not (tmp_path / "out" / "short_run").exists()
-
-
-def test_fix_refuses_what_is_not_decided(
-    unposed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    fixed = tmp_path / "fixed"
-    arguments = [
-        "inspect",
-        str(unposed),
-        "--out",
-        str(tmp_path / "out"),
-        "--fix",
-        str(fixed),
-        "--threads",
-        "1",
-    ]
-    assert run(arguments) == 2
-    assert "geometry does not decide" in capsys.readouterr().err
-    assert not fixed.exists()
-
-
-def test_fixing_needs_four_pictures(
-    demo_scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    scene = single_shots(demo_scene, tmp_path / "shots")
-    asked = ["inspect", str(scene), "--normals", "points", "--fix", str(tmp_path / "fixed")]
-    assert run([*asked, "--out", str(tmp_path / "out")]) == 2
-    said = " ".join(capsys.readouterr().err.split())
-    assert "--fix" in said
-    assert "angles.csv" in said
-    assert not (tmp_path / "fixed").exists()

@@ -95,7 +95,8 @@ def test_eval_writes_a_valid_record(
     for key in (
         "stokes_error",
         "depth_error_median_percent",
-        "haze_alpha",
+        "haze_free",
+        "haze_true",
         "depth_beyond",
         "mesh_fscore_1",
         "specular_psnr_dielectric",

@@ -174,12 +174,14 @@ def test_the_remedy_is_the_whole_calibration(
     checks = [order_check(angles), handedness_check(angles)]
     assert {check.verdict for check in checks} <= {"wrong", "ok"}
     for check in checks:
-        assert check.verdict == "ok" or f"repeat prepare with {expected} " in check.remedy
+        assert check.verdict == "ok" or f"Repeat prepare with {expected} " in check.remedy
     assert checks[0].verdict == "wrong"
     assert f"was prepared with {applied.options()}" in checks[0].remedy
 
 
-def test_a_scene_of_another_origin_is_only_offered_the_fix(ball_views) -> None:
+def test_a_scene_of_another_origin_gets_a_command(ball_views) -> None:
     views = tuple(mistaken(view, files=ORDERS[4].files()) for view in ball_views)
     evidence, _ = point_evidence(views, model_of(views), INDEX)
-    assert order_check(combine_evidence([evidence], 0)).remedy == "Write a corrected scene with --fix FOLDER."
+    remedy = order_check(combine_evidence([evidence], 0)).remedy
+    command = "polarguide prepare PICTURES --out NEW --poses SCENE --order 0,45,90,135 --sense cw --zero 0"
+    assert remedy == f"Write a corrected scene: {command}."

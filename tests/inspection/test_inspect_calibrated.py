@@ -8,7 +8,7 @@ from made_sensor import made_sensor, true_calibration, write_codes
 
 from polarguide.capture.sensor.analyzers import write_analyzers
 from polarguide.inspection.capture import read_capture
-from polarguide.inspection.corrections import analyzer_check
+from polarguide.inspection.picture_checks import analyzer_check
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import PrepareSettings
 

@@ -26,7 +26,6 @@ from made_sensor import made_sensor, write_polarizer_shots
 from plain_environment import declared, make_plain_environment
 from relief import write_relief
 
-import polarguide
 from polarguide.capture.sensor.pattern import sensor_pattern, tiled
 from polarguide.geometry.polarizer import ANGLES
 
@@ -62,7 +61,6 @@ SHORT = {
     "calibrate": [],
     "prepare": [],
     "inspect": ["--steps", "50"],
-    "inspect --fix": [],  # its decision takes a trained model
     "train": ["--steps", str(STEPS), "--downscale", "2"],
     "eval": [],
     "view": [],
@@ -139,22 +137,11 @@ def one_part(path: Path) -> None:
     shutil.copy(path.with_name("parts-of-one") / "v000.png", path)
 
 
-def misnamed(folder: Path) -> None:
-    """The demo's scene, whose files have the angles 45 and 135 exchanged in their names."""
-    shutil.copytree(Path(polarguide.__file__).parent / "data" / "demo", folder)
-    for path in (folder / "polar").glob("*_045.png"):
-        other = path.with_name(path.name.replace("_045", "_135"))
-        right = path.read_bytes()
-        path.write_bytes(other.read_bytes())
-        other.write_bytes(right)
-
-
 INPUTS: dict[str, dict[str, Callable[[Path], object]]] = {
     "calibrate": {"SHOTS": polarizer_shots},
     "run": {"RAW": raw_mosaics, "SHOTS": write_relief, "NUMBERED": numbered_shots},
     "prepare": {"RAW": raw_mosaics, "SHOTS": write_relief, "PHOTOS": photographs},
     "prepare --angles": {"SHOTS": single_shots},
-    "inspect --fix": {"SCENE": misnamed},
     "priors": {"part.png": one_part},
     "measure": {"PARTS": lambda folder: write_mosaics(folder, 2, color=False)},
 }
@@ -209,7 +196,7 @@ class Reader:
         assert verb in SHORT, f"how to shorten {text}? Add {verb} to SHORT"
         kind = next((f"{verb} {word}" for word in words if f"{verb} {word}" in INPUTS), verb)
         made = {name: make for name, make in INPUTS.get(kind, {}).items() if name in words}
-        outputs = [words[k + 1] for k, word in enumerate(words) if word in ("--out", "--video", "--fix")]
+        outputs = [words[k + 1] for k, word in enumerate(words) if word in ("--out", "--video")]
         before = self.set_aside([*made, *outputs])
         for name, make in made.items():
             make(self.folder / name)

@@ -106,15 +106,6 @@ def test_masks_follow_their_pictures(
     assert (read_mask(tmp_path / "out", "v001") == expected).all()
 
 
-def test_pictures_that_were_turned_before_poses_were_there_are_written_anew(tmp_path: Path) -> None:
-    light = write_turned(tmp_path / "in", 6, (128, 96))
-    prepare_scene(tmp_path / "in", tmp_path / "out", replace(SETTINGS, poses="none"))
-    assert read_polar(tmp_path / "out", "v000").shape[1:3] == (128, 96)
-    model = write_model(tmp_path / "model", NAMES, "PINHOLE 128 96 110 112 61 50")
-    prepare_scene(tmp_path / "in", tmp_path / "out", replace(SETTINGS, poses=str(model)))
-    assert np.abs(read_polar(tmp_path / "out", "v000") - behind(light)).max() < 0.03
-
-
 @pytest.mark.parametrize(
     ("lens", "asked", "size", "reason"),
     [

@@ -124,7 +124,7 @@ def test_saturated_samples_make_pixels_invalid(tmp_path: Path) -> None:
     values[8, 12] = 1.0
     values[40:44, 20:24] = 0.0
     write_mosaic(tmp_path / "in" / "v.png", values, bits=12)
-    settings = replace(COLORED, demosaic="half", white_balance="2,1,2", register=False)
+    settings = replace(COLORED, demosaic="half", register=False)
     prepare_scene(tmp_path / "in", tmp_path / "out", settings)
     invalid = read_invalid(tmp_path / "out", "v")
     inside = np.zeros_like(invalid)
@@ -135,18 +135,6 @@ def test_saturated_samples_make_pixels_invalid(tmp_path: Path) -> None:
     record = summary(tmp_path / "out")["prepare"]["views"]["v"]
     assert record["clipped_share"] == pytest.approx(1 / values.size, abs=1e-6)
     assert record["dark_share"] == pytest.approx(16 / values.size, abs=1e-6)
-
-
-def test_white_balance(tmp_path: Path) -> None:
-    light = smooth_light()
-    write_mosaic(tmp_path / "in" / "v.png", mosaic(behind(light), COLOR))
-    prepare_scene(tmp_path / "in", tmp_path / "given", replace(COLORED, white_balance="1,1.25,1.6"))
-    prepare_scene(tmp_path / "in", tmp_path / "gray", replace(COLORED, white_balance="gray"))
-    given, gray = summary(tmp_path / "given"), summary(tmp_path / "gray")
-    assert given["scale"] == pytest.approx(1 / 1.6)
-    expected = superpixels(light, COLOR) * np.array([1, 1.25, 1.6]) / 1.6
-    np.testing.assert_allclose(read_polar(tmp_path / "given", "v"), expected, atol=4e-5)
-    np.testing.assert_allclose(gray["white_balance"], [0.8, 1.0, 0.8 / 0.6], rtol=0.02)
 
 
 @pytest.mark.parametrize("pattern", [COLOR, MONO])

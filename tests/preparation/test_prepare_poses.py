@@ -14,7 +14,6 @@ import pycolmap
 import pytest
 from camera_files import (
     COLOR,
-    MONO,
     behind,
     mosaic,
     read_invalid,
@@ -203,7 +202,6 @@ def test_pictures_for_sfm_with_less_glare() -> None:
     [
         ({"intrinsics": "260,260,160"}, Fault("--intrinsics", expected="fx,fy,cx,cy or")),
         ({"intrinsics": "260,0,160,120"}, Fault("--intrinsics", expected="fx,fy,cx,cy or")),
-        ({"refine_intrinsics": True}, Fault("--refine-intrinsics", expected="initial values")),
         ({"intrinsics": "9,9,9,9", "poses": "none"}, Fault(expected="--poses sfm")),
         ({"masks": "nowhere"}, Fault("--masks", expected="a folder of masks")),
     ],
@@ -242,20 +240,6 @@ def test_masks_have_to_fit(tmp_path: Path) -> None:
     Fault("v0.png", expected="the size of the picture").raised_by(
         prepare_scene, tmp_path / "in", tmp_path / "out", settings
     )
-
-
-def test_poses_may_follow_on_none(tmp_path: Path) -> None:
-    for name in NAMES:
-        write_mosaic(tmp_path / "in" / f"{name}.png", mosaic(behind(smooth_light(color=False)), MONO))
-    settings = replace(MOSAIC, sensor="IMX250MZR", poses="none")
-    prepare_scene(tmp_path / "in", tmp_path / "out", settings)
-    written = (tmp_path / "out" / "polar" / "v000_000.png").stat().st_mtime_ns
-    model = write_model(tmp_path / "model", NAMES[:2], "PINHOLE 64 48 80 82 32 24")
-    done = prepare_scene(tmp_path / "in", tmp_path / "out", replace(settings, poses=str(model)))
-    assert done.new
-    assert done.left_out == ["v002"]
-    assert (tmp_path / "out" / "polar" / "v000_000.png").stat().st_mtime_ns == written
-    assert len(load_scene(tmp_path / "out").views) == 2
 
 
 @pytest.mark.parametrize(("files", "model"), [("NFD", "NFC"), ("NFC", "NFD")])

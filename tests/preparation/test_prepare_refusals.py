@@ -80,13 +80,6 @@ MOSAICS: dict[str, tuple[Callable[[Path], object], PrepareSettings, Fault]] = {
         Fault(expected="photographs in color", found="which is gray", remedy="Raw mosaics: --sensor, one of IMX250MYR")
     ),
     "unknown sensor": (lambda d: None, replace(MOSAIC, sensor="IMX1"), Fault("--sensor", "IMX250MYR,", "IMX1")),
-    "gray white balance": (
-        lambda d: None, replace(MOSAIC, sensor="IMX250MZR", white_balance="gray"), Fault("--white-balance")
-    ),
-    "broken white balance": (
-        lambda d: None, replace(MOSAIC, white_balance="1,2"),
-        Fault("--white-balance", found="'1,2'")
-    ),
     "black level": (lambda d: None, replace(MOSAIC, black_level=70000.0), Fault("--black-level")),
     "nan black level": (lambda d: None, replace(MOSAIC, black_level=float("nan")), Fault("--black-level", found="nan")),
     "saturation": (lambda d: None, replace(MOSAIC, saturation=70000), Fault("--saturation")),

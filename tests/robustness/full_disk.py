@@ -55,14 +55,6 @@ def _train() -> str:
     return f"train scene --out new {STEPS} --checkpoint-every 3 --threads 1 --device cpu{more}"
 
 
-def _fix() -> str:
-    """``inspect --fix`` with the order that it would have found; it is not decided on so small a scene."""
-    capture = importlib.import_module("polarguide.inspection.capture").read_capture(Path("scene"))
-    order = importlib.import_module("polarguide.capture.calibration").Calibration(order=(90, 45, 0, 135))
-    importlib.import_module("polarguide.inspection.corrections").fix_scene(capture, order, Path("new"))
-    return ""
-
-
 PICTURES = f"render run --out new {ONE}"
 WRITERS = (
     Writer("train", _train, (0.0, 0.6)),
@@ -74,7 +66,6 @@ WRITERS = (
     Writer("render video", "render run --path orbit --video new.mp4 --frames 3", (0.6,)),
     Writer("priors", READ, (0.6,)),
     Writer("inspect", INSPECT, (0.6,)),
-    Writer("inspect --fix", _fix, (0.6,)),
     Writer("share", "share run --out new/page.html", (0.6,)),
     *(Writer(f"export {kind}", export(kind), (0.6,))
       for kind in ("ply", "spz", "environment", "cameras", "normals")),

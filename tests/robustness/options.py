@@ -26,7 +26,7 @@ VERBS = (
     ("export run --out new", "resolution", "", "format layout picture"),
     ("priors scene --out new", "downscale", "refractive-index threshold", "views"),
     (MOSAICS, "bits saturation offset-x seed", "black-level zero",
-     "order white-balance sensor calibration dark-frame masks poses intrinsics"),
+     "order sensor calibration dark-frame masks poses intrinsics"),
     (MEASURE.replace(f" {ONE}", ""), "bits saturation offset-x offset-y threads",
      "threshold settle patience idle black-level full-well read-noise snr",
      "roi limits reference calibration dark-frame sensor"),

@@ -69,7 +69,6 @@ CASES += table(
     Case("bench among the pictures", command="bench --out scene/polar/x --scenes car --render-only"),
     Case("render among the pictures", command=into("scene/polar", RENDER), ci=True),
     Case("inspect into its scene", command=into("scene", INSPECT)),
-    Case("inspect with a fix over the scene", command=f"{INSPECT} --fix scene", ci=True),
     Case("cameras over the scene's", command=into("scene", export("cameras")), ci=True),
     Case("a film into a scene", command=f"{FILM} --out scene", ci=True),
     Case("a film among the pictures of a scene", command=f"{FILM} --video scene/polar/film.mp4", ci=True),

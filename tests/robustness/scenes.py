@@ -41,7 +41,7 @@ CASES += table(
          found="occurs twice", ci=True),
     Case("with a polarizer of brackets", write_json(SCENE, {"polarizer": {"a": [1]}})),
     Case("of a prepared scene, with gains of words", field("prepared/scene.json", "gains", to={"0": 0, "45": "x"}),
-         f"{of('prepared', INSPECT)} --fix fixed", passes=UNUSED),
+         of('prepared', INSPECT), passes=UNUSED),
 )  # fmt: skip
 
 

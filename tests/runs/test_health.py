@@ -20,7 +20,7 @@ from polarguide.capture.exposures import FOUR, PLAIN, Exposure
 from polarguide.capture.variants import select_exposures
 from polarguide.core.options import SceneOptions, SessionOptions
 from polarguide.core.progress import SILENT
-from polarguide.geometry.camera import Camera
+from polarguide.geometry.camera import Camera, look_at
 from polarguide.methods import RECIPES
 from polarguide.raster import choose_backend
 from polarguide.runs.folder import RunLog
@@ -58,6 +58,15 @@ def around(scene: Scene, count: int = 12) -> Scene:
     return dataclasses.replace(scene, views=tuple(views), test_names=())
 
 
+def ball_depth(camera: Camera) -> Tensor:
+    """Camera depth of a unit ball at the origin, 0 beside it."""
+    rays = camera.world_rays(dtype=torch.float64)
+    along = -(rays @ camera.center)
+    under_root = along.square() - camera.center.square().sum() + 1
+    distance = along - under_root.clamp(min=0).sqrt()
+    return torch.where(under_root > 0, distance * camera.rays(dtype=torch.float64)[..., 2], 0.0).float()
+
+
 class StandIn:
     """Renders what was measured in each view, but for its faults: a change of the result, by the view's name."""
 
@@ -65,20 +74,21 @@ class StandIn:
 
     def __init__(self, scene: Scene, **faults: Callable[[RenderResult], RenderResult]) -> None:
         self._views, self._faults = {id(view.camera): view for view in scene.views}, faults
-        self.fog: dict[str, float] = {}
+        self.haze: dict[Camera, float] = {}
 
     def render(self, camera: Camera, **_: bool) -> RenderResult:
         view = self._views[id(camera)]
         final = view.photograph()
         alpha, radii = torch.ones(final.shape[:2]), torch.ones(10, dtype=torch.int32)
-        result = RenderResult({"final": final, "base": final, "alpha": alpha}, training={"radii": radii})
+        layers = {"final": final, "base": final, "alpha": alpha, "depth": ball_depth(camera)}
+        result = RenderResult(layers, training={"radii": radii})
         return self._faults.get(view.name, lambda same: same)(result)
 
     def stokes(self, result: RenderResult, camera: Camera) -> Tensor:
         return self._views[id(camera)].stokes()
 
     def alpha_in_front(self, camera: Camera, depth: Tensor) -> Tensor:
-        return torch.full_like(depth, self.fog.get(self._views[id(camera)].name, 0.0))
+        return (depth > 0) * self.haze.get(camera, 0.0)
 
 
 def evidence(scene: Scene, views: tuple[View, ...] | None = None) -> TrainingEvidence:
@@ -176,12 +186,30 @@ def test_a_fault_of_one_view_is_one_warning_that_names_it(
     assert not any(view.name in said for view in scene.views if view.name != "v04")
 
 
-def test_fog_before_a_camera_is_named() -> None:
+def test_haze_in_front_of_a_training_view_or_a_held_out_view_is_named() -> None:
     scene = around(WHOLE)
     model = StandIn(scene)
-    model.fog = {"v07": 0.05}
-    (said,) = examined(model, scene).warnings
-    assert "v07 (5.0 % of the light)" in said
+    held_out = circling(0.3)
+    model.haze = {scene.views[7].camera: 0.05, held_out: 0.07, scene.views[2].camera: 0.019}
+    (message,) = examined(model, scene).warnings
+    assert "haze in front of v07 (5.0 % opacity)" in message
+    seen = dataclasses.replace(evidence(scene), held_out={"h1": held_out})
+    health = examine(model, seen, scene.points, LONG, SILENT)
+    (message,) = health.warnings
+    assert "haze in front of h1 (7.0 % opacity), v07:" in message
+    assert health.haze["v02"] == pytest.approx(0.019)
+
+
+def test_a_view_without_a_confirmed_surface_has_no_haze() -> None:
+    scene = around(WHOLE)
+    model = StandIn(scene)
+    away = look_at((4.0, 0.0, 0.0), (8.0, 0.0, 0.0), (0.0, -1.0, 0.0))
+    other = dataclasses.replace(scene.views[0].camera, rotation=away[0], translation=away[1])
+    model.haze = {other: 0.5}
+    seen = dataclasses.replace(evidence(scene), held_out={"h1": other})
+    health = examine(model, seen, scene.points, LONG, SILENT)
+    assert "h1" not in health.haze
+    assert health.warnings == ()
 
 
 def test_gaussians_that_no_view_sees_are_counted_once_all_views_were_looked_at() -> None:
@@ -228,7 +256,7 @@ def test_half_and_double_the_limits_tell_the_same_of_a_burned_view() -> None:
     found = examined(StandIn(scene, v04=bright), scene)
     for factor in (0.5, 2.0):
         limits = Limits(burned=factor * Limits().burned, far=factor * Limits().far)
-        assert len(warnings_of(found.views, found.unseen, limits)) == 1
+        assert len(warnings_of(found.views, found.unseen, found.haze, limits)) == 1
 
 
 def test_the_word_says_what_most_views_tell_and_what_is_in_doubt() -> None:

@@ -1,6 +1,5 @@
 """What a run takes from its scene: the refractive index, and what is masked; it stays the same when it goes on."""
 
-import dataclasses
 import json
 import shutil
 from pathlib import Path
@@ -8,12 +7,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-import torch
 from faults import Fault
 
 import polarguide
 from polarguide.capture import load_scene
-from polarguide.capture.scene import chosen_views, far_from_training
 from polarguide.core.options import SceneOptions
 from polarguide.core.progress import Reporter
 from polarguide.core.system import MemoryBound
@@ -204,20 +201,6 @@ def test_the_run_records_which_views_were_held_out(demo_scene: Path, tmp_path: P
     assert held["directions"] != held["every-8th"]
     again = {"settings": TrainSettings(steps=2), "reading": reading, "resume": True}
     Fault("test_views").raised_by(polarguide.train, scene, tmp_path / "directions", **again)
-
-
-def test_opening_a_run_does_not_judge_a_split_that_is_not_its_own(whole_demo: Path, tmp_path: Path) -> None:
-    scene = tmp_path / "scene"
-    shutil.copytree(whole_demo, scene, ignore=shutil.ignore_patterns("split.json"))
-    run = polarguide.train(scene, tmp_path / "run", settings=TrainSettings(steps=2), reading=READING)
-    first = run.scene.views[0].name  # held out by its place among the names
-    far = dataclasses.replace(run.scene.views[0].camera, translation=torch.tensor([50.0, 0.0, 0.0]).double())
-    cameras = {view.name: view.camera for view in run.scene.views} | {first: far}
-    assert far_from_training(cameras, chosen_views(cameras, "every-8th")) == [first]
-    assert far_from_training(cameras, chosen_views(cameras, "directions")) == []
-    tests = load_scene(scene, split="every-8th", test_views=run.scene.test_names)
-    assert tests.test_names == run.scene.test_names
-    assert not [warning for warning in tests.warnings if "far from" in warning]
 
 
 def test_a_run_that_records_no_test_views_is_refused(trained: Path, tmp_path: Path) -> None:

@@ -30,7 +30,7 @@ from tests.shots.test_read import CUP, MONO, write_four, write_mosaic
 
 MOSAIC_ONLY: list[dict[str, Any]] = [
     {"black_level": 500.0}, {"flip": "x"}, {"gamma": 0.8}, {"demosaic": "quarter"}, {"packing": "12p"},
-    {"dark_frame": Path("none.png")}, {"offset_x": 2}, {"interpolation": "guided"}, {"width": 2448},
+    {"dark_frame": Path("none.png")}, {"offset_x": 2}, {"demosaic": "half"}, {"width": 2448},
 ]  # fmt: skip
 
 

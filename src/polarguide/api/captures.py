@@ -39,6 +39,6 @@ def inspect(
     """
     folder = inspection_folder(Path(scene), None if out is None else Path(out))
     backend = choose_backend(device, say=reporter.say)
-    inspection = inspect_scene(Path(scene), folder, settings, backend, reporter)
+    inspection = inspect_scene(Path(scene), settings, backend, reporter)
     write_inspection(inspection, folder, reporter)
     return inspection

@@ -67,7 +67,7 @@ from polarguide.capture.sensor.pattern import (
 from polarguide.capture.sensor.raw_file import RawFormat, read_mosaic, require_mosaic
 from polarguide.capture.view import FULL_CODE
 from polarguide.capture.view_reader import require_alike
-from polarguide.core.errors import PolarguideError
+from polarguide.core.errors import PolarguideError, require
 from polarguide.core.files import require_file
 from polarguide.core.progress import Advance
 from polarguide.geometry.polarizer import ANGLES
@@ -191,23 +191,23 @@ class MosaicFiles:
         if self._options.dark_frame is None:
             return None
         dark = self._turned_back(self._options.dark_frame, read_mosaic(self._options.dark_frame, self._raw))
-        if dark.shape != shape:
-            raise PolarguideError(
-                self._options.dark_frame,
-                expected=f"a dark frame of {shape[1]}x{shape[0]} pixels like the mosaics",
-                found=f"{dark.shape[1]}x{dark.shape[0]}",
-                remedy="Photograph it with the same region and settings, and with the lens covered.",
-            )
+        require(
+            dark.shape == shape,
+            self._options.dark_frame,
+            expected=f"a dark frame of {shape[1]}x{shape[0]} pixels like the mosaics",
+            found=f"{dark.shape[1]}x{dark.shape[0]}",
+            remedy="Photograph it with the same region and settings, and with the lens covered.",
+        )
         return self.cut(dark).astype(np.float32)
 
-    def light_of_blocks(
+    def ratio_of_blocks(
         self,
         samples: list[NDArray[Any]],
         levels: Levels,
         dark: NDArray[np.float32] | None,
         shape: tuple[int, ...],
-    ) -> tuple[float | None, NDArray[np.float64]]:
-        """Measure the ratio of the pair sums and the colors of the light in blocks of mosaics.
+    ) -> float | None:
+        """Measure the ratio of the pair sums in blocks of mosaics.
 
         Samples of different angles are at different pixels. Tent weights interpolate all of them to the center of
         a block of two periods, so gradients of the picture cancel in the ratio.
@@ -219,8 +219,7 @@ class MosaicFiles:
             shape: numbers of rows and columns of a mosaic after ``cut``.
 
         Returns:
-            The ratio (I0 + I90) / (I45 + I135), or None if the blocks are too dark; and the colors of the usable
-            blocks, [3, N].
+            The ratio (I0 + I90) / (I45 + I135), or None if the blocks are too dark.
         """
         values = np.concatenate(samples)
         period = self.pattern.period
@@ -237,16 +236,12 @@ class MosaicFiles:
         tent = np.concatenate([rising, rising[::-1]])
         weighted = linear * tent[:, None] * tent
         places = np.tile(self.pattern.angles, (2, 2))
-        # The weights of each angle and color sum to the number of their samples in a period.
+        # The weights of each angle sum to the number of its samples in a period.
         angles = np.stack([weighted[:, places == angle].sum(axis=1) for angle in ANGLES])
         angles *= 4 / period**2
-        colors = np.ones((3, len(values)))
-        if self.pattern.colors is not None:
-            filters = np.tile(self.pattern.colors, (2, 2))
-            colors = np.stack([weighted[:, filters == c].sum(axis=1) for c in range(3)]) / [[4], [8], [4]]
         base = levels.black if floor is None else floor
         usable = np.asarray((values < levels.saturation).all(axis=(1, 2)) & (values > base).any(axis=(1, 2)))
-        return pair_ratio(angles, usable), colors[:, usable]
+        return pair_ratio(angles, usable)
 
     def merged(
         self,
@@ -309,20 +304,11 @@ class MosaicFiles:
         return self.analyzers.apply(linear, offset=corner or self.corner), tuple(map(spread_to_cells, masks))
 
     def sample_factors(
-        self,
-        shape: tuple[int, ...],
-        gains: Sequence[float],
-        white: Sequence[float] = (1, 1, 1),
-        scale: float = 1.0,
+        self, shape: tuple[int, ...], gains: Sequence[float], scale: float = 1.0
     ) -> NDArray[np.float32]:
-        """Return the factor by which each sample of a mosaic is multiplied, [H, W].
-
-        It is ``scale * white / gain``, with the white balance of the sample's color and the gain of its angle.
-        """
+        """Return the factor by which each sample of a mosaic is multiplied, ``scale / gain`` of its angle, [H, W]."""
         of_angle = dict(zip(ANGLES, gains, strict=True))
         factors = np.vectorize(lambda angle: scale / of_angle[angle])(self.pattern.angles)
-        if self.pattern.colors is not None:
-            factors = factors * np.asarray(white)[self.pattern.colors]
         return tiled(factors.astype(np.float32), shape)
 
 
@@ -617,14 +603,11 @@ def levels_of_shot(
     return levels, level_notes(levels, counts, container, bits, stated)
 
 
-def levels_of_pictures(
-    paths: Sequence[Path], white: tuple[float, float, float], options: SampledOptions
-) -> tuple[Levels | None, list[str]]:
+def levels_of_pictures(paths: Sequence[Path], options: SampledOptions) -> tuple[Levels | None, list[str]]:
     """Estimate the levels (such as full scale) of the stored values of all pictures of a capture.
 
     Args:
         paths: files of the capture.
-        white: gains of R, G and B for camera raw files.
         options: options ``bits`` and ``saturation`` of the user.
 
     Returns:
@@ -639,7 +622,7 @@ def levels_of_pictures(
     counts = np.zeros(FULL_16 + 1, np.int64)
     container = 8
     for path in wide or paths:
-        values = read_stack([path], white).pictures
+        values = read_stack([path]).pictures
         container = 8 * values.dtype.itemsize
         counts += np.bincount(values.ravel(), minlength=len(counts))
     levels, notes = levels_of_capture(counts, container, options)
@@ -664,19 +647,14 @@ class BracketedShots:
         return cls(SINGLE, [shots])
 
     @classmethod
-    def read(
-        cls,
-        paths: Sequence[Path],
-        gains: tuple[float, float, float] = (1.0, 1.0, 1.0),
-        levels: Levels | None = None,
-    ) -> BracketedShots:
+    def read(cls, paths: Sequence[Path], levels: Levels | None = None) -> BracketedShots:
         """Read all exposures of the shots that some files represent. ``read_stack`` describes the arguments.
 
         Raises:
             PolarguideError: a file cannot be read, or files differ in size, depth, orientation or exposures.
         """
         bracket = Bracket.of(paths)
-        shots = [read_stack(files, gains, levels) for files in bracket.files]
+        shots = [read_stack(files, levels) for files in bracket.files]
         for files, others in zip(bracket.files, shots, strict=True):
             require_alike(files[0], others.pictures[0], bracket.files[0][0], shots[0].pictures[0])
         return cls(bracket, shots)

@@ -19,7 +19,7 @@ from functools import lru_cache
 from pathlib import Path
 
 from polarguide.capture.layout import ambiguous, list_files
-from polarguide.core.errors import PolarguideError, require
+from polarguide.core.errors import require
 from polarguide.core.files import read_rows
 from polarguide.core.options import LARGEST_STOPS
 from polarguide.core.records import shortened
@@ -72,26 +72,26 @@ def _read_table(table: Path, *_: int) -> dict[str, ExposureName]:
     """Read the shot and the exposure of each file that a table lists."""
     rows = read_rows(table, _REMEDY)
     header = [cell.lower() for cell in rows[0][1]] if rows else []
-    if header != _COLUMNS:
-        raise PolarguideError(
-            f"{table} (line 1)",
-            expected=f"the header {','.join(_COLUMNS)}",
-            found=shortened(",".join(header)) if header else "an empty file",
-            remedy=_REMEDY,
-        )
+    require(
+        header == _COLUMNS,
+        f"{table} (line 1)",
+        expected=f"the header {','.join(_COLUMNS)}",
+        found=shortened(",".join(header)) if header else "an empty file",
+        remedy=_REMEDY,
+    )
     existing = {canonical(path.name) for path in table.parent.iterdir()}
     entries: dict[str, ExposureName] = {}
     for number, row in rows[1:]:
         file, shot, text = (*row, "", "", "")[:3]
         stops = number_or_nan(text) if text else None
         valid = stops is None or abs(stops) <= LARGEST_STOPS
-        if len(row) not in (2, 3) or not file or not shot or not valid or canonical(file) in entries:
-            raise PolarguideError(
-                f"{table} (line {number})",
-                expected=f"a file that is listed once, the name of its shot, and stops up to {LARGEST_STOPS:g}",
-                found=shortened(",".join(row)),
-                remedy=_REMEDY,
-            )
+        require(
+            len(row) in (2, 3) and file and shot and valid and canonical(file) not in entries,
+            f"{table} (line {number})",
+            expected=f"a file that is listed once, the name of its shot, and stops up to {LARGEST_STOPS:g}",
+            found=shortened(",".join(row)),
+            remedy=_REMEDY,
+        )
         require(
             canonical(file) in existing,
             f"{table} (line {number})",

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from polarguide import optics
 from polarguide.capture.calibration import Calibration
-from polarguide.core.errors import PolarguideError
+from polarguide.core.errors import PolarguideError, require
 from polarguide.core.files import read_rows, stored
 from polarguide.core.records import shortened
 from polarguide.core.text import canonical, csv_lines, decimal_comma, number_or_nan
@@ -293,21 +293,26 @@ def _listed_twice(where: str, first: Line, second: Line) -> PolarguideError:
 def _header(path: Path, row: list[str]) -> list[str]:
     columns = [cell.lower() for cell in row]
     known = set(columns) <= {*_COLUMNS, *_WRITTEN_BY_TRAINING} and len(set(columns)) == len(columns)
-    if not known or not set(_NEEDED) <= set(columns):
-        raise PolarguideError(
-            f"{path} (line 1)",
-            expected="the header file,angle or file,view,angle,gain",
-            found=shortened(",".join(row)) if row else "an empty file",
-            remedy=_REMEDY,
-        )
+    require(
+        known and set(_NEEDED) <= set(columns),
+        f"{path} (line 1)",
+        expected="the header file,angle or file,view,angle,gain",
+        found=shortened(",".join(row)) if row else "an empty file",
+        remedy=_REMEDY,
+    )
     return columns
 
 
 def _line(where: str, number: int, cells: Mapping[str, str]) -> Line:
     """Create a line from the text of its cells by column."""
     file = cells["file"]
-    if not file:
-        raise PolarguideError(where, expected="the name of a file", found="an empty cell", remedy=_REMEDY)
+    require(
+        file,
+        where,
+        expected="the name of a file",
+        found="an empty cell",
+        remedy=_REMEDY,
+    )
     angle = parse_angle(cells.get("angle", ""))
     if angle is None:
         raise PolarguideError(
@@ -317,13 +322,13 @@ def _line(where: str, number: int, cells: Mapping[str, str]) -> Line:
             remedy="Write unknown for an angle that was not noted, and none for a picture without a filter.",
         )
     gain = number_or_nan(cells["gain"]) if cells.get("gain") else None
-    if gain is not None and not 1 / _LARGEST_GAIN <= gain <= _LARGEST_GAIN:
-        raise PolarguideError(
-            f"{where}, {file}",
-            expected=f"a gain from {1 / _LARGEST_GAIN:g} to {_LARGEST_GAIN:g}, or an empty cell",
-            found=_cell(cells["gain"]),
-            remedy="Leave the cell empty if the gain is unknown.",
-        )
+    require(
+        gain is None or 1 / _LARGEST_GAIN <= gain <= _LARGEST_GAIN,
+        f"{where}, {file}",
+        expected=f"a gain from {1 / _LARGEST_GAIN:g} to {_LARGEST_GAIN:g}, or an empty cell",
+        found=_cell(cells.get("gain", "")),
+        remedy="Leave the cell empty if the gain is unknown.",
+    )
     return Line(
         number, posixpath.normpath(canonical(file)), canonical(cells.get("view", "")) or None, angle, gain
     )

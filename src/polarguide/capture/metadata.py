@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from polarguide.capture import box_filter as boxes
-from polarguide.capture.calibration import Calibration, Sense, combined
+from polarguide.capture.calibration import Calibration, Sense
 from polarguide.capture.formats.pictures import MOST_MATERIAL, decode_arrays
 from polarguide.core.errors import PolarguideError, require, unknown_view
 from polarguide.core.records import decode
@@ -63,6 +63,7 @@ class _Scene(msgspec.Struct):
     prepare: Any = None
     sensor: Any = None
     pair_sums: Any = None
+    corrections: Any = None
 
 
 class _Polarizer(msgspec.Struct):
@@ -71,22 +72,18 @@ class _Polarizer(msgspec.Struct):
     polarizer: Mount = "sensor"
 
 
-class _Angles(msgspec.Struct):
+class _Angles(msgspec.Struct, frozen=True):
     """Fields of ``scene.json`` for the calibration of the polarizer angles."""
 
     order: tuple[int, int, int, int] = ANGLES
     sense: Sense = "ccw"
     zero_degrees: float = 0.0
 
-    def calibration(self) -> Calibration:
-        return Calibration(order=self.order, sense=self.sense, zero=self.zero_degrees)
-
 
 class _Prepared(msgspec.Struct):
-    """Fields of ``scene.json`` for the changes of the polarizer angles by ``prepare`` and ``inspect --fix``."""
+    """Field of ``scene.json`` for the changes of the polarizer angles by ``prepare``."""
 
-    calibration: _Angles | None = None
-    corrections: list[_Angles] = []
+    calibration: _Angles = _Angles()
 
 
 def held_out(path: Path, data: bytes, names: list[str]) -> tuple[str, ...]:
@@ -208,25 +205,24 @@ def merges_exposures(path: Path, data: bytes) -> bool:
 
 
 def applied_calibration(path: Path, data: bytes) -> Calibration | None:
-    """Return the order, sense and zero that ``prepare`` and ``inspect --fix`` applied to the pictures of a scene.
+    """Return the order, sense and zero that ``prepare`` applied to the pictures of a scene.
 
     Args:
         path: path of ``scene.json`` for messages.
         data: its content.
 
     Returns:
-        The calibration; None if the scene was not written by ``prepare``.
+        The calibration. It is ``None`` if the scene was not written by ``prepare``, or if its pictures were corrected
+        later.
 
     Raises:
         PolarguideError: the calibration is invalid.
     """
-    if decode(data, _Scene, path, remedy="Prepare the scene again.").prepare is None:
+    scene = decode(data, _Scene, path, remedy="Prepare the scene again.")
+    if scene.prepare is None or scene.corrections:
         return None
-    scene = decode(data, _Prepared, path, remedy="Prepare the scene again.")
-    calibration: Calibration | None = (scene.calibration or _Angles()).calibration()
-    for correction in scene.corrections:
-        calibration = None if calibration is None else combined(calibration, correction.calibration())
-    return calibration
+    applied = decode(data, _Prepared, path, remedy="Prepare the scene again.").calibration
+    return Calibration(order=applied.order, sense=applied.sense, zero=applied.zero_degrees)
 
 
 Origin = Literal["mosaics", "stokes", "other"]

@@ -91,7 +91,6 @@ class RawMosaicOptions(MosaicOptions, SampledOptions, GainOptions):
         flip: Mirroring (Reverse X, Reverse Y) or counter-clockwise rotation of the mosaics in degrees. It is undone
             first.
         demosaic: Resolution as a fraction of the sensor's.
-        interpolation: Interpolation of missing colors and angles in the modes half and full.
         analyzers: calibration of the sensor from polarguide calibrate, which replaces gains.
     """
 
@@ -99,7 +98,6 @@ class RawMosaicOptions(MosaicOptions, SampledOptions, GainOptions):
     gamma: Annotated[float, Meta(ge=0.1, le=4.0)] = 1.0
     flip: Literal["none", "x", "y", "xy", "90", "270"] = "none"
     demosaic: Literal["half", "quarter", "full"] = "half"
-    interpolation: Literal["bilinear", "guided"] = "bilinear"
     analyzers: Annotated[Path | None, tyro.conf.Suppress] = None
 
 

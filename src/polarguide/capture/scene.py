@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import itertools
 import os
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -59,15 +58,6 @@ from polarguide.optics import Mount
 
 TEST_EVERY = 8
 """Number of views for each held-out view. One view in eight is held out."""
-FAR = 2.5
-"""Largest distance of a held-out view from its nearest training view, relative to the usual distance of neighbors.
-
-A held-out view with a larger distance counts as far from all training views.
-"""
-FEWEST_IN_BAND = 4
-"""Smallest number of held-out views at neighboring heights that are reported as a band without training views."""
-SAME_HEIGHT = 1e-3
-"""Largest difference of two heights that count as equal, as a share of the range of all heights."""
 _ROUNDS = 10
 
 
@@ -89,44 +79,6 @@ def chosen_views(cameras: Mapping[str, Camera], split: Split) -> tuple[str, ...]
         return tuple(names[::TEST_EVERY])
     apart = _distances([cameras[name] for name in names])
     return tuple(names[k] for k in sorted(_middles(apart, -(-len(names) // TEST_EVERY))))
-
-
-def far_from_training(cameras: Mapping[str, Camera], tests: Sequence[str]) -> list[str]:
-    """Return the names of the held-out views that are far from all training views (see ``FAR``), sorted."""
-    names = sorted(cameras)
-    trains = [k for k, name in enumerate(names) if name not in tests]
-    if len(names) < 3 or not trains:
-        return []
-    apart = _distances([cameras[name] for name in names])
-    others = apart + np.diag(np.full(len(names), np.inf))
-    typical = float(np.median(others.min(axis=1)))
-    return [name for k, name in enumerate(names) if name in tests and apart[k, trains].min() > FAR * typical]
-
-
-def held_out_band(cameras: Mapping[str, Camera], tests: Sequence[str]) -> list[str]:
-    """Return the held-out views in the largest range of heights that has no training view.
-
-    An example is a capture in rings around an object, in which all views of one ring are held out. The list is empty
-    if the range has fewer than ``FEWEST_IN_BAND`` views, or less than half of the held-out views. Heights are measured
-    along the mean up direction of the pictures.
-    """
-    names = sorted(cameras)
-    if not names:
-        return []
-    up = -np.stack([cameras[name].rotation[1].double().numpy() for name in names]).mean(axis=0)
-    heights = np.stack([cameras[name].center.double().numpy() for name in names]) @ up
-    apart = max(SAME_HEIGHT * float(np.ptp(heights)), 1e-12)
-    rings: list[list[int]] = []
-    for k in (int(place) for place in np.argsort(heights, kind="stable")):
-        if rings and heights[k] - heights[rings[-1][0]] < apart:
-            rings[-1].append(k)
-        else:
-            rings.append([k])
-    runs = itertools.groupby(rings, lambda ring: all(names[k] in tests for k in ring))
-    bands = [[names[k] for ring in run for k in ring] for is_held_out, run in runs if is_held_out]
-    longest = max(bands, key=len, default=[])
-    enough = len(longest) >= FEWEST_IN_BAND and 2 * len(longest) >= len(tests) and len(tests) < len(names)
-    return sorted(longest) if enough else []
 
 
 def _distances(cameras: Sequence[Camera]) -> NDArray[np.float64]:
@@ -520,7 +472,7 @@ def load_scene(
     files = Files()
     for file in (*model.files, *([layout.table] if layout.table is not None else [])):
         files.read(file)
-    tests, split_warnings = _held_out(root / "split.json", files, layout, model, split, test_views)
+    tests = _held_out(root / "split.json", files, layout, model, split, test_views)
     about = files.read_if_there(root / "scene.json", b"{}")
     index = refractive_index_of(root / "scene.json", about)
     indices = indices_of(root / "scene.json", about)
@@ -560,7 +512,6 @@ def load_scene(
     warnings = [
         *layout.warnings,
         *model.warnings,
-        *split_warnings,
         *_content_warnings(layout, stored, without_pixels),
         *unseen_points(model.points, [camera for camera in stored.cameras if camera is not None]),
         *_pose_warnings(model, layout.names, stored.data),
@@ -590,32 +541,15 @@ def _held_out(
     model: ColmapModel,
     split: Split,
     test_views: Sequence[str] | None,
-) -> tuple[tuple[str, ...], list[str]]:
-    """Choose the held-out views, and warn about views that training views do not surround.
-
-    Returns:
-        The names of the held-out views, and a list of up to one warning. The warning names held-out views that are far
-        from all training views, or that fill a band of heights without training views.
-    """
+) -> tuple[str, ...]:
+    """Choose the held-out views, and return their names."""
     check_choice("split", split, get_args(Split))
     data = files.read_if_there(path, None)
     posed = frozenset(model.names)
     cameras = {name: model.camera(name) for name in layout.names if name in posed}
-    if test_views is not None:  # a choice by the user causes no warning
-        return tuple(name for name in sorted(test_views) if name in layout.names), []
-    tests = chosen_views(cameras, split) if data is None else held_out(path, data, layout.names)
-    other = (
-        "use --split directions" if data is None and split != "directions" else "name others in split.json"
-    )
-    if far := far_from_training(cameras, tests):
-        fault = f"{len(far)} of {len(tests)} test views are far from every training view ({listed(far)})"
-    elif band := held_out_band(cameras, tests):
-        fault = (
-            f"{len(band)} of {len(tests)} test views fill a band of heights, such as a ring ({listed(band)})"
-        )
-    else:
-        return tests, []
-    return tests, [f"{fault}: their scores measure extrapolation. If this is not intended, {other}."]
+    if test_views is not None:
+        return tuple(name for name in sorted(test_views) if name in layout.names)
+    return chosen_views(cameras, split) if data is None else held_out(path, data, layout.names)
 
 
 def read_views(

@@ -10,7 +10,6 @@ from typing import Annotated, Any
 import tyro
 
 from polarguide.cli.console import ConsoleReporter, console, say, set_threads
-from polarguide.core.errors import PolarguideError
 from polarguide.core.options import ComputeOptions, ThreadOptions
 from polarguide.core.text import command
 from polarguide.inspection.settings import InspectSettings
@@ -59,7 +58,6 @@ def inspect_capture(
     /,
     *,
     out: Path | None = None,
-    fix: Path | None = None,
     settings: Annotated[InspectSettings, tyro.conf.arg(name="")],
     compute: Annotated[ComputeOptions, tyro.conf.arg(name="")],
 ) -> None:
@@ -72,15 +70,13 @@ def inspect_capture(
     Args:
         scene: Scene folder.
         out: Folder for the page; default: SCENE-inspection next to the scene.
-        fix: New folder for a corrected copy of the scene, written if the order, the direction or the zero is wrong
-            and the correction is certain.
     """
     set_threads(compute.threads)
     reporter = ConsoleReporter()
     inspection = importlib.import_module("polarguide.inspection.inspect")
     folder = inspection.inspection_folder(scene, out)
     backend = importlib.import_module("polarguide.raster").choose_backend(compute.device, say=reporter.say)
-    inspected = inspection.inspect_scene(scene, folder, settings, backend, reporter)
+    inspected = inspection.inspect_scene(scene, settings, backend, reporter)
     page, record = importlib.import_module("polarguide.inspection.report").write_inspection(
         inspected, folder, reporter
     )
@@ -89,26 +85,6 @@ def inspect_capture(
         _print_angles(inspected.angles)
     _print_verdict(inspected)
     say(f"page: {page}   figures: {record}")
-    if fix is not None:
-        _fix(inspected, fix, reporter)
-
-
-def _fix(inspected: Any, out: Path, reporter: ConsoleReporter) -> None:
-    """Write the corrected copy, or print that nothing needs correction."""
-    fixing = importlib.import_module("polarguide.inspection.corrections")
-    if not inspected.capture.four:
-        raise PolarguideError(
-            "--fix",
-            expected="a scene with four pictures of each view",
-            found="a scene whose angles are listed in angles.csv",
-            remedy="Edit SCENE/angles.csv as the page of the inspection says, or repeat polarguide prepare.",
-        )
-    change = fixing.correction(inspected.capture, inspected.angles)
-    if change is None:
-        say("fix: order, sense and zero are right; nothing was written.")
-        return
-    copy = fixing.fix_scene(inspected.capture, change, out, reporter)
-    say(f"fixed: {out}: {copy}. {inspected.capture.root} is as it was.")
 
 
 def _print_checks(checks: Any) -> None:

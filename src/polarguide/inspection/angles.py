@@ -23,7 +23,6 @@ from polarguide.capture.calibration import Calibration, combined
 from polarguide.capture.view import ANGLES
 from polarguide.inspection.settings import Check, first_outcome
 
-FIX = "Write a corrected scene with --fix FOLDER"
 MOSAICS = {
     (1, 45): "--flip x (Reverse X), or --flip 90 (rotated counter-clockwise)",
     (1, 135): "--flip y (Reverse Y), or --flip 270 (rotated clockwise)",
@@ -76,21 +75,22 @@ class AngleFindings:
         """
         if self.order is None or self.files is None:
             return ""
-        if self.applied is None:
-            return f"{FIX}."
-        unchanged = self.applied.true_angles() == (ANGLES, 0.0) and abs(offset) <= AngleLimits.zero_off
+        applied = self.applied or Calibration()
+        unchanged = applied.true_angles() == (ANGLES, 0.0) and abs(offset) <= AngleLimits.zero_off
         options = MOSAICS.get((self.order.sense, self.order.zero)) if self.mosaic and unchanged else None
         if options is not None:
             return (
                 "A sensor's angles are fixed: the mosaics were mirrored or rotated, or their region starts elsewhere. "
                 f"Repeat prepare with {options} and a new --out."
             )
-        whole = combined(self.applied, Calibration(order=self.files, zero=round(offset, 1)))
+        whole = combined(applied, Calibration(order=self.files, zero=round(offset, 1)))
         if whole is None:
-            return f"{FIX}."
+            return "Repeat prepare without --order, --sense and --zero and with a new --out, and inspect the result."
+        if self.applied is None:
+            return f"Write a corrected scene: polarguide prepare PICTURES --out NEW --poses SCENE {whole.options()}."
         return (
-            f"{FIX}, or repeat prepare with {whole.options()} and a new --out. This is the complete calibration; the "
-            f"scene was prepared with {self.applied.options()}."
+            f"Repeat prepare with {whole.options()} and a new --out. This is the complete calibration; the scene was "
+            f"prepared with {applied.options()}."
         )
 
     @property

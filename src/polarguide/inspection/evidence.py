@@ -2,8 +2,7 @@
 
 Specular light is polarized perpendicular to the plane of incidence, diffuse light parallel to it. Normals come from a
 short training on photographs, which are the means of the four pictures. They do not depend on the order of the
-pictures. A comparison with the AoLP is therefore valid, and remains valid after a correction of the order. The state of
-the training is kept in a folder and resumed.
+pictures. A comparison with the AoLP is therefore valid.
 
 AoLP and azimuth of the normals agree modulo 90 degrees. The multiple of 90 degrees follows from certainly specular
 pixels, whose DoLP exceeds that of diffuse light at their zenith.
@@ -11,19 +10,15 @@ pixels, whose DoLP exceeds that of diffuse light at their zenith.
 
 from __future__ import annotations
 
-import hashlib
-import json
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample, interpolate
 
-from polarguide import __version__, optics
+from polarguide import optics
 from polarguide.capture import Scene, View
 from polarguide.capture.angle_evidence import (
     DEGREES,
@@ -34,16 +29,12 @@ from polarguide.capture.angle_evidence import (
     sum_by_cluster,
 )
 from polarguide.capture.colmap.model import ColmapModel
-from polarguide.capture.exposures import FOUR
-from polarguide.core.errors import PolarguideError
-from polarguide.core.files import write_text
-from polarguide.core.records import read_record
 from polarguide.geometry.camera import Camera
 from polarguide.geometry.vectors import dot, unit
 from polarguide.inspection.capture import InspectedView
 from polarguide.methods import recipe_named
 from polarguide.raster import Backend
-from polarguide.runs.folder import CHECKPOINT, load_checkpoint, resolve, save_checkpoint
+from polarguide.runs.folder import resolve
 from polarguide.shading.gbuffer import RenderRequest, render
 from polarguide.training.angles.fits import gaussian_training
 from polarguide.training.context import TrainingContext
@@ -399,29 +390,10 @@ NORMALS_RECIPE = "3dgs-dr:consistent"
 """Name of the recipe of the short training that gives the normals."""
 LONGEST = 160
 """Largest width or height of the training pictures in pixels, after averaging by a whole factor."""
-KEY = "short_run.json"
-SAVE_EVERY = 100
-
-
-def photograph_digest(scene: Scene) -> str:
-    """Return the SHA-256 of the input of the short training: photographs, camera poses and points.
-
-    The order of the four pictures of a view does not affect the digest.
-    """
-    digest = hashlib.sha256(scene.points.numpy().tobytes())
-    for view in scene.train_views:
-        camera = view.camera
-        photograph = view.codes.to(torch.int32).sum(dim=0)
-        for tensor in (photograph, view.invalid, camera.rotation, camera.translation):
-            digest.update(tensor.numpy().tobytes())
-        others = "" if view.exposures == FOUR else repr(view.exposures)
-        digest.update(f"{(view.name, camera.fx, camera.fy, camera.cx, camera.cy)}{others}".encode())
-    return digest.hexdigest()
 
 
 def short_run(
     scene: Scene,
-    folder: Path,
     *,
     steps: int,
     backend: Backend,
@@ -430,11 +402,10 @@ def short_run(
     recipe: Recipe | None = None,
     until: int = 0,
 ) -> TrainingState:
-    """Run or resume the short training that gives normals, or load its finished state.
+    """Run the short training that gives normals or angles, and return its state.
 
     Args:
         scene: scene at the size of the training.
-        folder: folder of its state. The state of another scene or length is replaced.
         steps: number of optimizer steps.
         backend: device and rasterizer.
         on_step: callback after every step.
@@ -444,38 +415,10 @@ def short_run(
     """
     recipe = recipe or training_recipe(NORMALS_RECIPE)
     settings = resolve(TrainSettings(steps, 0, refractive_index, begin_again=False), scene, recipe)
-    key = {
-        "photographs": photograph_digest(scene),
-        "steps": steps,
-        "recipe": recipe.name,
-        "refractive_index": settings.refractive_index,
-        "version": __version__,
-    }
-    until = until or steps
-    state = load_checkpoint(folder, recipe, backend.device) if _is_state_of(folder, key) else None
-    loop, _ = gaussian_training(TrainingContext(scene, recipe, settings, backend), state)
-    if state is None:
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / CHECKPOINT).unlink(missing_ok=True)
-        write_text(folder / KEY, json.dumps(key))
-    try:
-        while loop.state.step < until:
-            on_step(loop.step())
-            if loop.state.step % SAVE_EVERY == 0 or loop.state.step == until:
-                save_checkpoint(folder, loop.state)
-    except KeyboardInterrupt:
-        if loop.whole:
-            save_checkpoint(folder, loop.state)
-        raise
+    loop, _ = gaussian_training(TrainingContext(scene, recipe, settings, backend), None)
+    while loop.state.step < (until or steps):
+        on_step(loop.step())
     return loop.state
-
-
-def _is_state_of(folder: Path, key: dict[str, object]) -> bool:
-    """Return True if the folder contains a readable state of a training with the given key."""
-    try:
-        return read_record(folder / KEY, dict[str, Any]) == key and (folder / CHECKPOINT).exists()
-    except PolarguideError:
-        return False
 
 
 @torch.no_grad()

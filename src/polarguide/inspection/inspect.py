@@ -20,7 +20,7 @@ from polarguide.capture import Scene, load_scene
 from polarguide.capture.angle_evidence import OrderEvidence, posterior
 from polarguide.capture.layout import refuse_scene
 from polarguide.capture.view import listed
-from polarguide.core.errors import PolarguideError
+from polarguide.core.errors import require
 from polarguide.core.files import check_out, require_inside
 from polarguide.core.options import index_of
 from polarguide.core.progress import SILENT, Reporter
@@ -30,7 +30,6 @@ from polarguide.geometry.scene_frame import scene_frame
 from polarguide.geometry.vectors import unit_array
 from polarguide.inspection.angles import AngleFindings, angle_checks, combine_evidence
 from polarguide.inspection.capture import Capture, InspectedView, ViewMeasurements, measure_view, read_capture
-from polarguide.inspection.corrections import analyzer_check
 from polarguide.inspection.evidence import (
     LONGEST,
     SurfaceSamples,
@@ -42,6 +41,7 @@ from polarguide.inspection.evidence import (
     trained_surface,
 )
 from polarguide.inspection.picture_checks import (
+    analyzer_check,
     dielectric_check,
     find_pairing,
     light_checks,
@@ -58,9 +58,6 @@ from polarguide.inspection.shots import (
 )
 from polarguide.inspection.view_checks import held_out_check, lens_check, view_exposure_check
 from polarguide.raster import Backend
-
-RUN_FOLDER = "short_run"
-"""Name of the folder for the short training, inside the folder of an inspection."""
 
 
 class PoseLimits:
@@ -298,18 +295,17 @@ def inspection_folder(scene: Path, out: Path | None = None) -> Path:
     folder = beside if out is None else out
     check_out(folder)
     refuse_scene(folder)
-    require_inside(beside.parent if out is None else folder, folder, folder / RUN_FOLDER)
+    require_inside(beside.parent if out is None else folder, folder)
     return folder
 
 
 def inspect_scene(
-    path: Path, out: Path, settings: InspectSettings, backend: Backend, reporter: Reporter = SILENT
+    path: Path, settings: InspectSettings, backend: Backend, reporter: Reporter = SILENT
 ) -> Inspection:
     """Inspect a scene folder.
 
     Args:
         path: the scene. It may have no poses.
-        out: folder for the state of a short training.
         settings: settings of the inspection.
         backend: device and rasterizer of the short training.
         reporter: receiver of the progress.
@@ -326,7 +322,7 @@ def inspect_scene(
             measurements.append(measure_view(view, index))
             advance(len(measurements))
     if not capture.four:
-        checks, shots = _shots(capture, measurements, out, settings, index, backend, reporter)
+        checks, shots = _shots(capture, measurements, settings, index, backend, reporter)
         return Inspection(capture, settings, index, tuple(measurements), tuple(checks), shots)
     pairing = find_pairing(capture)
     checks = picture_checks(capture, measurements, pairing)
@@ -335,7 +331,7 @@ def inspect_scene(
     checks.append(view_exposure_check(capture))
     with reporter.track("matching features", 1):
         checks += [pose_check(capture), lens_check(capture), coverage_check(capture), held_out_check(capture)]
-    angles, pixels = _angles(capture, out, settings, index, pairing or 0, backend, reporter)
+    angles, pixels = _angles(capture, settings, index, pairing or 0, backend, reporter)
     angles = with_noise(angles, measurements)
     checks += [*angle_checks(angles), dielectric_check(measurements, pixels, index)]
     return Inspection(capture, settings, index, tuple(measurements), tuple(checks), angles)
@@ -344,7 +340,6 @@ def inspect_scene(
 def _shots(
     capture: Capture,
     measurements: Sequence[ViewMeasurements],
-    out: Path,
     settings: InspectSettings,
     index: float,
     backend: Backend,
@@ -364,7 +359,6 @@ def _shots(
         with reporter.track("short training", settings.steps) as advance:
             findings = estimate_shot_angles(
                 scene,
-                out / RUN_FOLDER,
                 steps=settings.steps,
                 refractive_index=index,
                 backend=backend,
@@ -375,7 +369,6 @@ def _shots(
 
 def _angles(
     capture: Capture,
-    out: Path,
     settings: InspectSettings,
     index: float,
     pairing: int,
@@ -397,14 +390,13 @@ def _angles(
         if settings.normals == "auto" and evidence.usable:
             trains = trains and max(posterior(evidence).probabilities) < PoseLimits.sure
         if trains:
-            pixels = _trained_pixels(capture, out, settings, pairing, index, backend, reporter)
+            pixels = _trained_pixels(capture, settings, pairing, index, backend, reporter)
             sources.append(normal_evidence(pixels, index))
     return combine_evidence(sources, pairing, capture.applied, mosaic=capture.origin == "mosaics"), pixels
 
 
 def _trained_pixels(
     capture: Capture,
-    out: Path,
     settings: InspectSettings,
     pairing: int,
     index: float,
@@ -415,7 +407,6 @@ def _trained_pixels(
     with reporter.track("short training", settings.steps) as advance:
         state = short_run(
             scene,
-            out / RUN_FOLDER,
             steps=settings.steps,
             backend=backend,
             on_step=lambda report: advance(report.step + 1),
@@ -452,8 +443,11 @@ def _training_scene(
         test_views=held_out,
         reporter=reporter,
     )
-    if not scene.train_views:
-        raise PolarguideError(
-            capture.root, expected="views to train on", found="none", remedy="Use --normals points."
-        )
+    require(
+        scene.train_views,
+        capture.root,
+        expected="views to train on",
+        found="none",
+        remedy="Use --normals points.",
+    )
     return scene

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
+import msgspec
 import numpy as np
 import torch
 
@@ -16,6 +17,8 @@ from polarguide.capture import checks
 from polarguide.capture.angle_evidence import PAIRINGS, AngleLimits, decide_pairing, swaps
 from polarguide.capture.checks import MeasuredGains, measured_gains, pair_moments
 from polarguide.capture.view import ANGLES, FULL_CODE, listed
+from polarguide.core.files import read_file
+from polarguide.core.records import decode
 from polarguide.inspection.angles import AngleFindings
 from polarguide.inspection.capture import POLARIZED, Capture, ViewMeasurements
 from polarguide.inspection.evidence import EvidenceLimits, SurfaceSamples
@@ -138,7 +141,7 @@ def _pairs(measurements: Sequence[ViewMeasurements], pairing: int | None) -> Che
             pairing,
             "wrong",
             f"The pair sums agree only if {swaps(PAIRINGS[pairing or 0])}.",
-            "Rename the files. --fix renames them once the order is decided.",
+            "Rename the files, or repeat prepare with --order and a new --out.",
         ),
         (not off, "ok", f"I0 + I90 and I45 + I135 differ by {error:.1%} of S0 (median).", ""),
         (
@@ -366,6 +369,24 @@ def _polarization(measurements: Sequence[ViewMeasurements]) -> Check:
     return Check(
         "low_dolp", *outcome, figures={"polarized": share, "median_dolp": median, "p99_dolp": strongest}
     )
+
+
+class _SceneNotes(msgspec.Struct):
+    """Fields of ``scene.json`` that the inspection reports."""
+
+    analyzers: dict[str, str] | None = None
+
+
+def analyzer_check(capture: Capture) -> Check | None:
+    """Report the calibration of the sensor that ``prepare`` applied. Return None if there is no calibration."""
+    path = capture.root / "scene.json"
+    data = read_file(path) if path.exists() else b"{}"
+    analyzers = decode(data, _SceneNotes, path, remedy="Prepare the scene again.").analyzers
+    if analyzers is None:
+        return None
+    lens = f" and {analyzers['lens']}" if analyzers.get("lens") else ""
+    name = f"the calibration of {analyzers.get('sensor', '')}{lens} ({analyzers.get('sha256', '')[:16]})"
+    return Check("analyzers", "ok", f"Prepared with {name}.", figures=analyzers)
 
 
 def dielectric_check(

@@ -21,7 +21,7 @@ class InspectSettings:
     Attributes:
         normals: Evidence on the angles. points uses only points that several views observe. train also trains normals
             without polarization. auto trains if the points do not decide.
-        steps: Optimizer steps of this training. Its state is kept in the folder of the inspection, and resumed.
+        steps: Optimizer steps of this training.
         refractive_index: Refractive index of the surfaces. By default, that of scene.json, else 1.5.
         downscale: Width of pixel blocks that are averaged first. 0 averages until pictures are at most 640 pixels wide
             and high.

@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -141,7 +140,6 @@ def without_angles(scene: Scene) -> Scene:
 
 def estimate_shot_angles(
     scene: Scene,
-    folder: Path,
     *,
     steps: int,
     refractive_index: float,
@@ -152,7 +150,6 @@ def estimate_shot_angles(
 
     Args:
         scene: scene at the size of the training. It needs training views.
-        folder: folder of the training's state. A stopped training resumes from it.
         steps: approximate number of training steps.
         refractive_index: refractive index of the surfaces.
         backend: device and rasterizer.
@@ -166,7 +163,6 @@ def estimate_shot_angles(
     until = Polarizers(blind, recipe, total).search + 1  # the fit is done before the step
     state = short_run(
         blind,
-        folder,
         steps=total,
         until=until,
         recipe=recipe,

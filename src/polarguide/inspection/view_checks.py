@@ -19,9 +19,9 @@ from polarguide.capture.colmap.model import ColmapModel
 from polarguide.capture.point_exposures import significant
 from polarguide.capture.view import listed
 from polarguide.geometry.camera import Camera, seen_at
+from polarguide.geometry.coverage import Coverage, DepthMap
 from polarguide.inspection.capture import Capture
 from polarguide.inspection.settings import Check, first_outcome
-from polarguide.results.evaluation.coverage import Coverage, DepthMap
 
 
 class ViewLimits:

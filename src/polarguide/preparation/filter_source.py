@@ -70,7 +70,7 @@ from polarguide.capture.point_exposures import (
 from polarguide.capture.sensor.pattern import Levels
 from polarguide.capture.view import ANGLES, FULL_CODE, listed
 from polarguide.capture.write import EXACT, picture_names, rounding_of, suffix_of
-from polarguide.core.errors import PolarguideError, PolarguideWarning
+from polarguide.core.errors import PolarguideWarning, require
 from polarguide.core.files import write_whole
 from polarguide.core.progress import Advance, Reporter
 from polarguide.optics.color import srgb_decode_array
@@ -82,7 +82,7 @@ from polarguide.preparation.journal import (
     ViewRecord,
     stops_record,
 )
-from polarguide.preparation.settings import FilterSettings, SinglesSettings, white_gains
+from polarguide.preparation.settings import FilterSettings, SinglesSettings
 from polarguide.preparation.source import DevelopedView, Source, Stored
 
 _JUDGED_VIEWS = 8
@@ -130,30 +130,20 @@ class ShotsSource(Source):
             settings: settings of the preparation.
 
         Raises:
-            PolarguideError: the white balance or the transfer function does not fit the files.
+            PolarguideError: the transfer function does not fit the files.
         """
         self._settings = settings
         self._of_view = views
         self.paths = paths
         self.views = sorted(views)
         self._shots = [path for view in self.views for path in views[view]]
-        raw = [path for path in self._shots if is_camera_raw(path)]
-        white = white_gains(settings.white_balance)
-        if white is None or (white != (1.0, 1.0, 1.0) and len(raw) < len(self._shots)):
-            raise PolarguideError(
-                "--white-balance",
-                expected="none for pictures; none or three gains for camera raw",
-                found=settings.white_balance,
-                remedy="Remove the option.",
-            )
-        if raw and settings.transfer == "srgb":
-            raise PolarguideError(
-                "--transfer",
-                expected="auto or linear for camera raw, which is developed without tone curve",
-                found="srgb",
-                remedy="Remove the option.",
-            )
-        self._white = white
+        require(
+            settings.transfer != "srgb" or not any(map(is_camera_raw, self._shots)),
+            "--transfer",
+            expected="auto or linear for camera raw, which is developed without tone curve",
+            found="srgb",
+            remedy="Remove the option.",
+        )
         self._as_stored: frozenset[str] = frozenset()
 
     def stored(self, view: str) -> Stored:
@@ -204,9 +194,7 @@ class ShotsSource(Source):
         decision = transfer_of_pictures(
             self._shots,
             self._settings.transfer,
-            lambda: [
-                (read_stack(self._of_view[view], self._white, levels), self._angles(view)) for view in views
-            ],
+            lambda: [(read_stack(self._of_view[view], levels), self._angles(view)) for view in views],
         )
         if decision.doubt:
             warnings.warn(decision.doubt, PolarguideWarning, stacklevel=2)
@@ -219,7 +207,7 @@ class ShotsSource(Source):
         rounded.
         """
         first = self._shots[:1]
-        if self._settings.precision == "full" or read_stack(first, self._white).pictures.dtype != np.uint8:
+        if self._settings.precision == "full" or read_stack(first).pictures.dtype != np.uint8:
             return tuple(EXACT)
         levels = np.arange(256) / 255
         if transfer == "srgb":
@@ -235,7 +223,7 @@ class ShotsSource(Source):
         return self._merged(view, measured.levels, measured.transfer, align=align)
 
     def _merged(self, view: str, levels: Levels | None, transfer: str, *, align: bool) -> LinearShots:
-        read = BracketedShots.read(self._of_view[view], self._white, levels)
+        read = BracketedShots.read(self._of_view[view], levels)
         if self.used_as_stored(view):
             read = replace(read, shots=[replace(shots, orientation=1) for shots in read.shots])
         return LinearShots.of(read, transfer, align=align)
@@ -308,7 +296,7 @@ class FilterSource(ShotsSource):
         self._require_memory("four shots")
         settings = self._settings
         gains = settings.calibration.gains
-        levels, level_notes = levels_of_pictures(all_exposures(self._shots), self._white, self._settings)
+        levels, level_notes = levels_of_pictures(all_exposures(self._shots), self._settings)
         decision = self._decide_transfer(levels)
         stated, missing = stated_exposures(self._of_view, advance) if settings.gains != "none" else ({}, "")
         # One scale for all shots, with headroom for the largest gain that is corrected.
@@ -427,7 +415,7 @@ class SinglesSource(ShotsSource):
             "photographs of one kind of file",
             COMPARABLE,
         )
-        levels, level_notes = levels_of_pictures(all_exposures(self._shots), self._white, self._settings)
+        levels, level_notes = levels_of_pictures(all_exposures(self._shots), self._settings)
         decision = self._decide_transfer(levels)
         stated, missing = light_of_files(self._of_view, advance)
         light = {self._name(path): value for path, value in stated.items()}
@@ -571,7 +559,6 @@ def reconciled(
 
 # Smallest unusual deviation of a gain's logarithm (1.5 stops). A warning follows unless a file states this gain.
 _FAR = math.log(2.0) * 1.5
-_LISTED = 12
 
 
 @dataclass
@@ -632,7 +619,6 @@ def write_exposure_table(
     for picture in pictures:
         picture.record.gain = float(f"{math.exp(picture.log):.6g}")
         picture.record.points = picture.points
-    _say_table(pictures, reporter)
     # Names are not escaped, because the table is read again.
     rows = [(p.file, p.view, angle_text(p.record.angle), f"{p.record.gain:.6g}") for p in pictures]
     text = io.StringIO()
@@ -778,27 +764,3 @@ def _warn(
             reporter.warn(
                 f"The exposures of {len(far)} pictures differ from the others by more than 1.5 stops ({listed(far)})."
             )
-
-
-def _say_table(pictures: list[PictureRow], reporter: Reporter) -> None:
-    """Print the gains of all pictures, or only the most unusual ones if there are many.
-
-    Print nothing if all gains are 1.
-    """
-    if all(picture.record.gain == 1 for picture in pictures):
-        return
-    listing = pictures
-    if len(pictures) > _LISTED:
-        listing = sorted(
-            sorted(pictures, key=lambda p: -abs(p.log))[:_LISTED], key=lambda p: (p.view, p.file)
-        )
-    width = max(len("picture"), *(len(picture.file) for picture in listing))
-    rows = [f"{'picture':<{width}}   angle    gain  stops  points"]
-    for picture in listing:
-        gain = picture.record.gain or 1.0
-        angle = angle_text(picture.record.angle)
-        stops = f"{math.log2(gain):+.2f}"
-        rows.append(f"{picture.file:<{width}} {angle:>7} {gain:>7.3f} {stops:>6} {picture.points:>7}")
-    if len(listing) < len(pictures):
-        rows.append(f"... and {len(pictures) - len(listing)} closer to the mean; {TABLE} lists all.")
-    reporter.say("\n".join(rows))

@@ -5,12 +5,11 @@ Files are identified by their content, because copies, synchronization and moves
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from functools import partial
-from pathlib import Path, PurePath
+from pathlib import Path
 from typing import Annotated, Any, Generic, TypeVar
 
 import msgspec
@@ -20,14 +19,10 @@ from polarguide.capture.brackets import MergedExposures
 from polarguide.capture.colmap.poses import Geometry
 from polarguide.capture.exposures import Angle
 from polarguide.capture.view import FULL_CODE
-from polarguide.core.errors import PolarguideError
-from polarguide.core.records import read_record
 from polarguide.core.text import canonical
 
 Factor = Annotated[float, Meta(gt=0, le=1e12)]
-"""Type of a positive factor."""
 """Positive factor."""
-FourFactors = tuple[Factor, Factor, Factor, Factor]
 _Code = Annotated[int, Meta(ge=0, le=FULL_CODE)]
 _Multiple = tuple[_Code, Annotated[int, Meta(ge=1, le=FULL_CODE)]]
 StoredRounding = Annotated[tuple[_Multiple, ...], Meta(min_length=1)]
@@ -105,20 +100,6 @@ def stops_record(exposures: MergedExposures) -> list[float] | UnsetType:
     return [round(stop, 4) for stop in exposures.stops] if len(exposures.stops) > 1 else UNSET
 
 
-class FileStamp(msgspec.Struct, frozen=True, array_like=True):
-    """Identity of a file, to detect whether it has changed.
-
-    Attributes:
-        size: size in bytes.
-        time: time of its last change in nanoseconds. If size and time are unchanged, the digest is not computed again.
-        digest: SHA-256 of its content; empty in records of earlier versions.
-    """
-
-    size: int
-    time: int
-    digest: str = ""
-
-
 class Request(msgspec.Struct, omit_defaults=True):
     """Inputs of a preparation, which must stay equal when the preparation is resumed.
 
@@ -126,15 +107,13 @@ class Request(msgspec.Struct, omit_defaults=True):
         source: folder of the capture.
         format: format of the capture.
         settings: settings as JSON.
-        file: stamps of the files that are read, by name.
-        model: stamps of the files of the poses.
+        file: SHA-256 of the content of each file that is read, by name.
     """
 
     source: str
     format: str
     settings: dict[str, Any]
-    file: dict[str, FileStamp]
-    model: dict[str, FileStamp] = {}
+    file: dict[str, str]
 
 
 M = TypeVar("M")
@@ -159,59 +138,23 @@ _PATHS = ("dark_frame", "analyzers", "angles", "poses", "masks")
 """Names of settings that may be paths. These files are listed in the request."""
 
 
-def request_of(
-    root: Path,
-    earlier: Iterable[Path],
-    kind: str,
-    settings: dict[str, Any],
-    paths: Iterable[Path],
-    model: Iterable[Path],
-) -> Request:
+def request_of(root: Path, kind: str, settings: dict[str, Any], paths: Iterable[Path]) -> Request:
     """Return the request of a call.
 
     Args:
         root: folder of the capture.
-        earlier: records of earlier calls, which contain digests of unchanged files.
         kind: format of the capture.
         settings: settings as JSON.
         paths: files that are read; missing files are skipped.
-        model: files of the poses.
     """
-    known: Mapping[str, Mapping[str, FileStamp]] = {}
-    for record in earlier:
-        with contextlib.suppress(PolarguideError):  # ``SceneFolder`` reports it
-            request = read_record(record, Journal[Any]).prepare.request
-            known = {"file": request.file, "model": request.model}
-            break
-    files: dict[str, Path] = {}
+    roots = (root, Path(os.path.realpath(root)))
+    files = {}
     for path in paths:
         if path.exists():
-            folders = (
-                folder for folder in (root, Path(os.path.realpath(root))) if path.is_relative_to(folder)
-            )
-            folder = next(folders, None)
+            folder = next((folder for folder in roots if path.is_relative_to(folder)), None)
             name = f"../{path.name}" if folder is None else path.relative_to(folder).as_posix()
-            files[canonical(name)] = path
-    poses = {canonical(path.name): path for path in model}
-    return Request(
-        os.path.realpath(root),
-        kind,
-        settings,
-        _stamps(files, known.get("file", {})),
-        _stamps(poses, known.get("model", {})),
-    )
-
-
-def _stamps(files: Mapping[str, Path], known: Mapping[str, FileStamp]) -> dict[str, FileStamp]:
-    stamps = {}
-    for name, path in files.items():
-        status = path.stat()
-        stamp = FileStamp(status.st_size, status.st_mtime_ns)
-        before = known.get(name, stamp)
-        if not before.digest or (before.size, before.time) != (stamp.size, stamp.time):
-            before = msgspec.structs.replace(stamp, digest=_digest(path))
-        stamps[name] = before
-    return stamps
+            files[canonical(name)] = _digest(path)
+    return Request(os.path.realpath(root), kind, settings, files)
 
 
 def _digest(path: Path) -> str:
@@ -238,31 +181,13 @@ def changed_entry(before: Request, now: Request) -> tuple[str, str, str] | None:
     """
     if before.format != now.format:
         return "format", before.format, now.format
-    for part, files, now_files in (("file", before.file, now.file), ("model", before.model, now.model)):
-        digests = all(stamp.digest for stamp in files.values())
-        old, new = (_comparable(each, digests=digests) for each in (files, now_files))
-        for key in sorted(old.keys() | new.keys()):
-            if old.get(key) != new.get(key):
-                change = "removed" if key not in new else "changed" if key in old else "added"
-                return f"{part} {key}", "as it was", f"that was {change}"
     for key in sorted(before.settings.keys() | now.settings.keys()):
         values = [settings.get(key) for settings in (before.settings, now.settings)]
         paths = [key in _PATHS and isinstance(value, str) and os.path.isabs(value) for value in values]
-        missing = (key in before.settings) != (key in now.settings)
-        if missing or (values[0] != values[1] and not all(paths)):
+        if values[0] != values[1] and not all(paths):
             return key, str(values[0]), str(values[1])
+    for key in sorted(before.file.keys() | now.file.keys()):
+        if before.file.get(key) != now.file.get(key):
+            change = "removed" if key not in now.file else "changed" if key in before.file else "added"
+            return f"file {key}", "as it was", f"that was {change}"
     return None
-
-
-def _comparable(files: Mapping[str, FileStamp], *, digests: bool) -> dict[str, Any]:
-    """Return the sizes and digests of files, by name.
-
-    Without digests, return sizes and times, by names without folders.
-    """
-    if digests:
-        return {name: (stamp.size, stamp.digest) for name, stamp in files.items()}
-    named: dict[str, Any] = {}
-    for name, stamp in files.items():
-        key = canonical(PurePath(name).name)
-        named[key] = sorted([*named.get(key, ()), (stamp.size, stamp.time)])
-    return named

@@ -32,7 +32,7 @@ from polarguide.capture.pose_files import TEST, parts_of_poses, read_parts
 from polarguide.capture.sensor.pattern import SENSOR_NAMES
 from polarguide.capture.sensor.raw_file import RAW_SUFFIXES
 from polarguide.capture.view import ANGLES, listed
-from polarguide.core.errors import PolarguideError, PolarguideWarning
+from polarguide.core.errors import PolarguideError, PolarguideWarning, require
 from polarguide.core.files import require_folder
 from polarguide.core.progress import Reporter
 from polarguide.core.text import command, stem_of
@@ -55,13 +55,13 @@ def _find_masks(folder: Path, views: Sequence[str]) -> dict[str, Path]:
     Raises:
         PolarguideError: the folder does not exist, or no picture in it is named like a view.
     """
-    if not folder.is_dir():
-        raise PolarguideError(
-            "--masks",
-            expected="a folder of masks named like the views",
-            found=f"{folder}, which is not a folder",
-            remedy="Specify the folder that contains <view>.png.",
-        )
+    require(
+        folder.is_dir(),
+        "--masks",
+        expected="a folder of masks named like the views",
+        found=f"{folder}, which is not a folder",
+        remedy="Specify the folder that contains <view>.png.",
+    )
     files = sorted(folder.iterdir())
     masks: dict[str, Path] = {}
     for shorten in (str, view_of_name, lambda name: name.removesuffix("_mask")):
@@ -69,13 +69,13 @@ def _find_masks(folder: Path, views: Sequence[str]) -> dict[str, Path]:
             view = shorten(stem_of(path))
             if view in views and path.suffix.lower() in SUFFIXES:
                 masks.setdefault(view, path)
-    if not masks:
-        raise PolarguideError(
-            folder,
-            expected=f"masks named like the views ({listed(list(views), 3)})",
-            found=listed([path.name for path in files], 3) or "no file",
-            remedy="Rename them. Views without a mask are used completely.",
-        )
+    require(
+        masks,
+        folder,
+        expected=f"masks named like the views ({listed(list(views), 3)})",
+        found=listed([path.name for path in files], 3) or "no file",
+        remedy="Rename them. Views without a mask are used completely.",
+    )
     return masks
 
 
@@ -149,13 +149,13 @@ def _consecutive(
     notes: tuple[str, ...] = ()
     each = settings.shots_per_view
     if each is None and (each := shots_of_one_place(files)) is not None:
-        if len(stated) not in (1, each):
-            raise PolarguideError(
-                "--angles",
-                expected=f"{each} angles, because every {each} consecutive pictures show one place",
-                found=angles,
-                remedy="Correct the angles, or use --shots-per-view 1 if every picture is a view of its own.",
-            )
+        require(
+            len(stated) in (1, each),
+            "--angles",
+            expected=f"{each} angles, because every {each} consecutive pictures show one place",
+            found=angles,
+            remedy="Correct the angles, or use --shots-per-view 1 if every picture is a view of its own.",
+        )
         notes = (
             f"Groups of {each} consecutive pictures show one place. Each is one view, named like its first picture "
             "(--shots-per-view 1 makes a view of every picture).",
@@ -189,22 +189,22 @@ def _require_photographs(root: Path) -> None:
     if not files or index_shot_files(root, tuple(set(RAW_SUFFIXES) - set(SHOT_SUFFIXES))):
         raise _unknown_layout(root)
     for path in (files[0], files[-1]):
-        if path.suffix.lower() in RAW_SUFFIXES and _is_gray(path):  # like raw mosaics
-            raise PolarguideError(
-                root,
-                expected="photographs in color, or an option for gray pictures",
-                found=f"{path.name}, which is gray",
-                remedy=f"Raw mosaics: --sensor, one of {SENSOR_NAMES}. Ordinary photographs: --angles none. Shots "
-                "through a filter: --angles unknown, or angles in their names.",
-            )
-    numbered = numbered_like_angles(files)
-    if numbered:
-        raise PolarguideError(
+        require(
+            path.suffix.lower() not in RAW_SUFFIXES or not _is_gray(path),
             root,
-            expected="angles as in cup_45 or in folders 0, 45, 90 and 135",
-            found=f"pictures with angles in another form ({listed([p.name for p in numbered])})",
-            remedy="Rename them. Ordinary photographs without a filter: --angles none.",
+            expected="photographs in color, or an option for gray pictures",
+            found=f"{path.name}, which is gray",
+            remedy=f"Raw mosaics: --sensor, one of {SENSOR_NAMES}. Ordinary photographs: --angles none. Shots "
+            "through a filter: --angles unknown, or angles in their names.",
         )
+    numbered = numbered_like_angles(files)
+    require(
+        not numbered,
+        root,
+        expected="angles as in cup_45 or in folders 0, 45, 90 and 135",
+        found=f"pictures with angles in another form ({listed([p.name for p in numbered])})",
+        remedy="Rename them. Ordinary photographs without a filter: --angles none.",
+    )
     each = shots_of_one_place(files)
     if each is not None:
         angles = ",".join(f"{180 * k / each:g}" for k in range(each))
@@ -263,10 +263,13 @@ def frames_of_video(
             f"Not used: {names}. To prepare frames of a video, use polarguide prepare VIDEO --out SCENE."
         )
         return root, settings
-    if len(videos) > 1:
-        raise PolarguideError(
-            root, expected="one video", found=names, remedy="Specify one path: polarguide prepare VIDEO."
-        )
+    require(
+        len(videos) <= 1,
+        root,
+        expected="one video",
+        found=names,
+        remedy="Specify one path: polarguide prepare VIDEO.",
+    )
     folder = out.resolve().with_name(f"{out.resolve().name}-frames")
     count = extract_frames(videos[0], folder, reporter)
     reporter.say(f"{count} frames of {names} are in {folder}: the sharpest frame of each time interval.")
@@ -365,13 +368,13 @@ def origin_of_poses(pictures: Source, origin: str) -> str:
     """Return the origin of the poses: "dataset", "sfm", "none" or a path."""
     if origin == "auto":
         return "sfm" if pictures.cameras is None else "dataset"
-    if origin == "dataset" and pictures.cameras is None:
-        raise PolarguideError(
-            "--poses",
-            expected=f"sfm, none or the path of a COLMAP model for the format {pictures.kind}",
-            found="dataset",
-            remedy="Only published datasets contain poses.",
-        )
+    require(
+        origin != "dataset" or pictures.cameras is not None,
+        "--poses",
+        expected=f"sfm, none or the path of a COLMAP model for the format {pictures.kind}",
+        found="dataset",
+        remedy="Only published datasets contain poses.",
+    )
     return origin
 
 

@@ -9,11 +9,10 @@ from __future__ import annotations
 import contextlib
 import itertools
 import os
-import re
 import shlex
 import shutil
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -24,7 +23,7 @@ from numpy.typing import NDArray
 
 from polarguide import __version__
 from polarguide.capture.colmap.model import read_model
-from polarguide.capture.colmap.poses import Geometry, Poses, Undistortion
+from polarguide.capture.colmap.poses import Geometry, Poses
 from polarguide.capture.colmap.sfm import LEAST_VIEWS, NotConnectedError, add_points, reconstruct, tone_mapped
 from polarguide.capture.filter.camera_files import TURNS
 from polarguide.capture.filter.consecutive import chosen_matching
@@ -34,19 +33,17 @@ from polarguide.capture.view import ANGLES, listed
 from polarguide.capture.write import (
     EXACT,
     intensity_codes,
-    picture_name,
     picture_names,
     rounded_radiance,
     suffix_of,
     write_png_file,
     write_view,
 )
-from polarguide.core.errors import PolarguideError
+from polarguide.core.errors import PolarguideError, require
 from polarguide.core.files import (
     check_out,
     holds_files,
     make_folder,
-    read_file,
     require_inside,
     write_whole,
     writing,
@@ -54,7 +51,7 @@ from polarguide.core.files import (
 from polarguide.core.progress import Reporter
 from polarguide.core.records import decode, option_name, read_record, shortened, to_json
 from polarguide.core.system import only_writer
-from polarguide.core.text import canonical, stem_of
+from polarguide.core.text import canonical
 from polarguide.preparation.filter_source import write_exposure_table
 from polarguide.preparation.journal import (
     Journal,
@@ -85,11 +82,6 @@ PARTIAL = ".sparse.partial"
 FOLDERS = ("polar", "invalid", "masks", "sparse")
 """Folders of a scene that a preparation writes into."""
 REMEDY = "Choose another --out. Nothing was written."
-# Angle in the name of a picture.
-_LABEL = r"(\d{3}(\.\d+)?|unknown|none)(-\d+)?"
-_POSE_SETTINGS = ("poses", "poses_of", "matching", "sfm_pictures", "intrinsics", "refine_intrinsics", "seed")
-_EARLIER_SETTINGS = {"analyzers": None, "angles": None, "poses_of": "auto", "shots_per_view": None}
-"""Values of settings that were added later, for journals of earlier versions."""
 
 
 class SceneFolder:
@@ -100,8 +92,7 @@ class SceneFolder:
 
         Args:
             root: the folder.
-            request: source, files and settings of this call. They must equal those of an earlier call, except that
-                poses may be added to a scene without poses.
+            request: source, files and settings of this call. They must equal those of an earlier call.
             measured_type: type of the measurements of the source.
 
         Raises:
@@ -109,16 +100,12 @@ class SceneFolder:
         """
         self.root = root
         self.state = State[Any](request)
-        self.finished = False
-        self._finished_before: bytes | None = None
         self._existed = root.exists()
         check_out(root)
-        finished = root / SCENE
         unfinished = root / JOURNAL
-        path = unfinished if unfinished.exists() else finished
-        if path.exists():
-            follows_none = self._resume(path, request, measured_type)
-            self.finished = path == finished and not follows_none
+        self.finished = (root / SCENE).exists() and not unfinished.exists()
+        if self.finished or unfinished.exists():
+            self._resume(root / SCENE if self.finished else unfinished, request, measured_type)
         elif root.exists() and holds_files(root):
             raise PolarguideError(
                 root,
@@ -127,34 +114,22 @@ class SceneFolder:
                 remedy=REMEDY,
             )
 
-    def _resume(self, path: Path, request: Request, measured_type: type[Measured]) -> bool:
-        """Read the state of an earlier call. Return True if this call adds poses to views without poses."""
+    def _resume(self, path: Path, request: Request, measured_type: type[Measured]) -> None:
+        """Read the state of an earlier call."""
         content = read_record(path, dict[str, Any])
-        if "prepare" not in content:
-            raise PolarguideError(
-                self.root,
-                expected="a new folder, or one that prepare wrote",
-                found=f"a {path.name} of another origin",
-                remedy=REMEDY,
-            )
+        require(
+            "prepare" in content,
+            self.root,
+            expected="a new folder, or one that prepare wrote",
+            found=f"a {path.name} of another origin",
+            remedy=REMEDY,
+        )
         journal: Journal[Any] = decode(content, Journal[measured_type], path, remedy=REMEDY)  # type: ignore[valid-type]
         before = journal.prepare
-        for view, record in before.views.items():
-            _require_own_files(path, view, record.files)
-            if before.request.format == "singles":
+        if before.request.format == "singles":
+            for view, record in before.views.items():
                 _require_exposures(path, view, record)
-        settings = {**_EARLIER_SETTINGS, **before.request.settings}
-        now = dict(request.settings)
-        if settings.get("white_balance") == "grey":  # spelling in journals of earlier versions
-            settings["white_balance"] = "gray"
-        if settings.get("matching") == "exhaustive" and now["matching"] == "auto":
-            now["matching"] = "exhaustive"  # default of earlier versions
-        follows_none = settings.get("poses") == "none" != now["poses"]
-        if follows_none:
-            settings |= {name: now[name] for name in _POSE_SETTINGS}
-        model = request.model if follows_none else before.request.model
-        old = msgspec.structs.replace(before.request, settings=settings, model=model)
-        difference = changed_entry(old, msgspec.structs.replace(request, settings=now))
+        difference = changed_entry(before.request, request)
         if difference is not None:
             name, was, is_now = difference
             raise PolarguideError(
@@ -165,7 +140,6 @@ class SceneFolder:
             )
         views = {canonical(view): record for view, record in before.views.items()}
         self.state = State(request, before.measured, views)
-        return follows_none
 
     @property
     def views(self) -> dict[str, ViewRecord]:
@@ -198,30 +172,19 @@ class SceneFolder:
         """Write the request to the journal."""
         work = self.root / SFM
         require_inside(self.root, *(self.root / name for name in (*FOLDERS, PARTIAL, SFM)), *work.rglob("*"))
-        if (self.root / SCENE).exists():
-            self._finished_before = read_file(self.root / SCENE)
         make_folder(self.root)
         self.save()  # first, because a later call resumes from it
         make_folder(self.root / "polar")
         make_folder(self.root / "invalid")
-        (self.root / SCENE).unlink(missing_ok=True)
 
     def abandon(self) -> None:
-        """Undo this call: restore a scene without poses, or remove a new folder.
-
-        Views from an earlier call remain for the next call.
-        """
-        shutil.rmtree(self.root / SFM, ignore_errors=True)
-        if self._finished_before is not None:
-            write_whole(self.root / SCENE, self._finished_before)
-            (self.root / JOURNAL).unlink(missing_ok=True)
-        elif not self.views:
-            for name in FOLDERS:
-                shutil.rmtree(self.root / name, ignore_errors=True)
-            (self.root / JOURNAL).unlink(missing_ok=True)
-            if not self._existed:
-                with contextlib.suppress(OSError):  # another process added files
-                    self.root.rmdir()
+        """Undo a preparation that has written no view."""
+        for name in (SFM, *FOLDERS):
+            shutil.rmtree(self.root / name, ignore_errors=True)
+        (self.root / JOURNAL).unlink(missing_ok=True)
+        if not self._existed:
+            with contextlib.suppress(OSError):  # another process added files
+                self.root.rmdir()
 
     def save(self) -> None:
         """Write the journal."""
@@ -232,40 +195,12 @@ class SceneFolder:
         write_whole(self.root / SCENE, to_json({**summary, "prepare": msgspec.to_builtins(self.state)}))
         (self.root / JOURNAL).unlink(missing_ok=True)
 
-    def has(self, view: str, warp: WarpRecord | None) -> bool:
-        """Return True if the folder contains all files of a view, with the given lens distortion removed."""
+    def has(self, view: str) -> bool:
+        """Return True if the folder contains all files of a view."""
         record = self.views.get(view)
-        return (
-            record is not None
-            and record.warp == warp
-            and all(
-                (self.root / name).is_file() and (self.root / name).stat().st_size == size
-                for name, size in record.files.items()
-            )
-        )
-
-    def drop(self, view: str) -> None:
-        """Remove a view that an earlier call wrote without poses."""
-        for name in self.views.pop(view).files:
-            (self.root / name).unlink(missing_ok=True)
-        self.save()
-
-
-def _require_own_files(journal: Path, view: str, files: Iterable[str]) -> None:
-    """Check that a journal lists only files of the named view. Listed files may be removed later.
-
-    Raises:
-        PolarguideError: the journal lists a file of another view or folder.
-    """
-    pictures = re.compile(rf"polar/{re.escape(view)}_{_LABEL}\.(png|tif)")
-    own = {f"invalid/{view}.png", f"masks/{view}.png"}
-    others = sorted(name for name in set(files) - own if not pictures.fullmatch(name))
-    if others or set(view) & set("/\\\0"):
-        raise PolarguideError(
-            f"{journal} (views, {shortened(view)})",
-            expected=f"pictures of this view, {picture_name('VIEW', 0)} and so on",
-            found=shortened(others[0] if others else view),
-            remedy=REMEDY,
+        return record is not None and all(
+            (self.root / name).is_file() and (self.root / name).stat().st_size == size
+            for name, size in record.files.items()
         )
 
 
@@ -278,93 +213,84 @@ def _require_exposures(journal: Path, view: str, record: ViewRecord) -> None:
     angles = [exposure.angle for exposure in record.exposures or ()]
     named = picture_names(view, angles, suffix_of(record.files))
     pictures = sorted(name for name in record.files if name.startswith("polar/"))
-    if sorted(named) != pictures or not named:
-        raise PolarguideError(
-            f"{journal} (views, {shortened(view)})",
-            expected=f"the exposures of {shortened(pictures)}",
-            found=shortened(named),
-            remedy=REMEDY,
-        )
+    require(
+        sorted(named) == pictures and named,
+        f"{journal} (views, {shortened(view)})",
+        expected=f"the exposures of {shortened(pictures)}",
+        found=shortened(named),
+        remedy=REMEDY,
+    )
 
 
-class PoseEstimation:
-    """Estimation of camera poses and points, with temporary pictures in a hidden folder of the scene."""
+def _structure(folder: SceneFolder, pictures: Source, settings: PrepareSettings, reporter: Reporter) -> Path:
+    """Estimate the poses of all views by structure from motion, and return the folder of the COLMAP model.
 
-    def __init__(
-        self, folder: SceneFolder, pictures: Source, settings: PrepareSettings, reporter: Reporter
-    ) -> None:
-        self._folder = folder
-        self._pictures = pictures
-        self._settings = settings
-        self._reporter = reporter
-        self._root = folder.root / SFM
+    Raises:
+        PolarguideError: too few views are registered.
+    """
+    photographs = _photographs(folder, pictures, settings, reporter, pictures.views)
+    matching = chosen_matching(pictures.views, settings.matching, reporter)
+    settings = replace(settings, matching=matching)  # type: ignore[arg-type]
+    return reconstruct(
+        folder.root / SFM,
+        {view: geometry.size for view, geometry in photographs.items()},
+        matching=matching,
+        seed=settings.seed,
+        reporter=reporter,
+        untried=_untried(settings, pictures.kind),
+        intrinsics=None if settings.intrinsics is None else known_intrinsics(settings.intrinsics),
+        lenses=pictures.lenses(),
+    )
 
-    def structure(self) -> Path:
-        """Estimate the poses of all views by structure from motion, and return the folder of the COLMAP model.
 
-        Raises:
-            PolarguideError: too few views are registered.
-        """
-        sizes = {view: geometry.size for view, geometry in self._photographs(self._pictures.views).items()}
-        matching = chosen_matching(self._pictures.views, self._settings.matching, self._reporter)
-        settings = replace(self._settings, matching=matching)  # type: ignore[arg-type]
-        return reconstruct(
-            self._root,
-            sizes,
-            matching=matching,
-            seed=settings.seed,
-            reporter=self._reporter,
-            untried=_untried(settings, self._pictures.kind),
-            intrinsics=None if settings.intrinsics is None else known_intrinsics(settings.intrinsics),
-            refine=settings.refine_intrinsics,
-            lenses=self._pictures.lenses(),
-        )
+def _points(
+    folder: SceneFolder, pictures: Source, settings: PrepareSettings, poses: Poses, reporter: Reporter
+) -> tuple[Poses, dict[str, Any]]:
+    """Triangulate points for given poses.
 
-    def points(self, poses: Poses) -> tuple[Poses, dict[str, Any]]:
-        """Triangulate points for given poses.
+    Returns:
+        The poses with points; and a record of the triangulation.
 
-        Returns:
-            The poses with points; and a record of the triangulation.
+    Raises:
+        PolarguideError: the cameras do not look at a common place.
+    """
+    model, record = add_points(
+        folder.root / SFM,
+        poses.developed(_photographs(folder, pictures, settings, reporter, poses.views)),
+        poses.folder,
+        matching=chosen_matching(poses.views, settings.matching, reporter),
+        seed=settings.seed,
+        reporter=reporter,
+    )
+    return Poses.read(model, pictures.views), record
 
-        Raises:
-            PolarguideError: the cameras do not look at a common place.
-        """
-        cameras = poses.developed(self._photographs(poses.views))
-        settings = self._settings
-        model, record = add_points(
-            self._root,
-            cameras,
-            poses.folder,
-            matching=chosen_matching(poses.views, settings.matching, self._reporter),
-            seed=settings.seed,
-            reporter=self._reporter,
-        )
-        return Poses.read(model, self._pictures.views), record
 
-    def _photographs(self, views: list[str]) -> dict[str, Geometry]:
-        """Write tone-mapped pictures and object masks of views. Return size and orientation of each picture."""
-        images = self._root / "images"
-        masks = self._root / "masks"
-        measured = self._folder.measured
-        known = measured.photographs or {}
-        measured.photographs = known
-        if images.is_dir() and any(stem_of(path) not in views for path in images.iterdir()):
-            shutil.rmtree(self._root, ignore_errors=True)  # from an earlier call with other poses
-            known.clear()
-        for path in (images, masks):
-            make_folder(path)
-        with self._reporter.track("photographs", len(views)) as advance:
-            for count, view in enumerate(views, 1):
-                path = images / f"{view}.png"
-                if view not in known or not path.exists():
-                    done = develop_view(self._pictures, view, measured)
-                    if done.mask is not None:
-                        write_png_file(masks / f"{view}.png", done.mask.astype(np.uint8) * 255)
-                    write_png_file(path, tone_mapped(done.intensities, self._settings.sfm_pictures))
-                    known[view] = done.record.geometry
-                    self._folder.save()
-                advance(count)
-        return {view: known[view] for view in views}
+def _photographs(
+    folder: SceneFolder, pictures: Source, settings: PrepareSettings, reporter: Reporter, views: list[str]
+) -> dict[str, Geometry]:
+    """Write tone-mapped pictures and object masks of views to a hidden folder of the scene.
+
+    Returns:
+        Size and orientation of each picture by view.
+    """
+    images = folder.root / SFM / "images"
+    masks = folder.root / SFM / "masks"
+    known = folder.measured.photographs or {}
+    folder.measured.photographs = known
+    for path in (images, masks):
+        make_folder(path)
+    with reporter.track("photographs", len(views)) as advance:
+        for count, view in enumerate(views, 1):
+            path = images / f"{view}.png"
+            if view not in known or not path.exists():
+                done = develop_view(pictures, view, folder.measured)
+                if done.mask is not None:
+                    write_png_file(masks / f"{view}.png", done.mask.astype(np.uint8) * 255)
+                write_png_file(path, tone_mapped(done.intensities, settings.sfm_pictures))
+                known[view] = done.record.geometry
+                folder.save()
+            advance(count)
+    return {view: known[view] for view in views}
 
 
 def _untried(settings: PrepareSettings, kind: str) -> str:
@@ -429,13 +355,13 @@ def prepare_scene(
     root, settings = frames_of_video(Path(source), target, settings, reporter)
     pictures = open_source(root, settings)
     settings = replace(settings, poses=origin_of_poses(pictures, settings.poses))
-    if settings.poses != "sfm" and settings.intrinsics is not None:
-        raise PolarguideError(
-            "--intrinsics",
-            expected="--poses sfm with --intrinsics",
-            found=f"--poses {settings.poses}",
-            remedy="Omit --intrinsics: the poses contain the cameras.",
-        )
+    require(
+        settings.poses == "sfm" or settings.intrinsics is None,
+        "--intrinsics",
+        expected="--poses sfm with --intrinsics",
+        found=f"--poses {settings.poses}",
+        remedy="Omit --intrinsics: the poses contain the cameras.",
+    )
     if settings.poses == "sfm" and len(pictures.views) < LEAST_VIEWS:
         raise PolarguideError(
             root,
@@ -447,14 +373,9 @@ def prepare_scene(
     frames = ""
     if poses is not None and settings.poses != "dataset":
         frames = settle_pose_frames(pictures, poses, settings.poses_of)
-    request = request_of(
-        root,
-        [target / JOURNAL, target / SCENE],
-        pictures.kind,
-        settings.record(),
-        [*pictures.paths, *pictures.masks.values()],
-        poses.files if poses is not None else (),
-    )
+    model = () if poses is None else poses.files
+    files = [*pictures.paths, *pictures.masks.values(), *model]
+    request = request_of(root, pictures.kind, settings.record(), files)
     folder = SceneFolder(target, request, pictures.measured_type)
     if folder.finished:
         reporter.say(f"{target} is already complete.")
@@ -494,11 +415,10 @@ def _write_scene(
     """Write the missing parts of a scene whose capture has been measured."""
     tests = () if poses is None else poses.held_out
     folder.start()
-    work = PoseEstimation(folder, pictures, settings, reporter)
     points: dict[str, Any] | None = None
     if settings.poses == "sfm":
         try:
-            poses = Poses.read(work.structure(), pictures.views)
+            poses = Poses.read(_structure(folder, pictures, settings, reporter), pictures.views)
         except NotConnectedError as error:
             folder.abandon()
             raise PolarguideError(
@@ -509,7 +429,7 @@ def _write_scene(
             ) from None
         points = {"from": "structure from motion", "count": poses.points}
     elif poses is not None and not poses.points:
-        poses, points = work.points(poses)
+        poses, points = _points(folder, pictures, settings, poses, reporter)
     elif poses is not None:
         points = {"from": "the model given", "count": poses.points}
     if poses is not None and poses.missing:
@@ -556,20 +476,11 @@ def _without_poses(root: Path, pictures: Source, settings: PrepareSettings) -> s
 
 def _write_views(folder: SceneFolder, pictures: Source, poses: Poses | None, reporter: Reporter) -> None:
     views = pictures.views if poses is None else poses.views
-    for view in folder.views.keys() - set(views):
-        folder.drop(view)
     faults: list[str] = []
     notes: list[str] = []
     with reporter.track("writing views", len(views)) as advance:
         for count, view in enumerate(views, 1):
-            known = folder.views.get(view)
-            warp = None
-            if known is not None and known.turned and pictures.used_as_stored(view):
-                folder.drop(view)  # an earlier call without poses rotated it for display
-                known = None
-            if known is not None and poses is not None:
-                warp = _warp_record(poses.warp(view, known.geometry))
-            if not folder.has(view, warp):
+            if not folder.has(view):
                 view_faults, view_notes = _write_view(folder, pictures, view, poses)
                 faults += view_faults
                 notes += view_notes
@@ -604,7 +515,8 @@ def _write_view(
         warp = poses.warp(view, record.geometry)
         intensities, invalid = warp.apply(intensities, invalid)
         mask = None if mask is None else warp.apply_mask(mask)
-        record.warp = _warp_record(warp)
+        removed = warp.record()
+        record.warp = None if removed is None else WarpRecord(**removed)
     rounding = getattr(folder.measured, "rounding", EXACT)
     if not folder.measured.bracketed:
         codes: NDArray[Any] = intensity_codes(intensities, invalid, rounding)
@@ -629,12 +541,6 @@ def _write_view(
     return faults, done.notes
 
 
-def _warp_record(warp: Undistortion) -> WarpRecord | None:
-    """Return the record of a removed lens distortion, or None if the lens has no distortion."""
-    record = warp.record()
-    return None if record is None else WarpRecord(**record)
-
-
 def _turns(folder: SceneFolder) -> str:
     """Return a note on the views that were rotated for display. The note is empty if there are no such views."""
     records = [record for record in folder.views.values() if record.turned]
@@ -656,6 +562,8 @@ def _write_model(folder: SceneFolder, poses: Poses) -> None:
     for old in (partial, final):
         shutil.rmtree(old, ignore_errors=True)
     make_folder(partial / "sparse" / "0")
+    for view in poses.views:
+        poses.warp(view, folder.views[view].geometry)
     poses.write(partial / "sparse" / "0")
     model = read_model(partial)
     for view in poses.views:

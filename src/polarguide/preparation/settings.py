@@ -23,7 +23,7 @@ from polarguide.capture.raw_options import (
     misplaced,
 )
 from polarguide.capture.sensor.analyzers import is_analyzer_file
-from polarguide.core.errors import PolarguideError
+from polarguide.core.errors import PolarguideError, require
 from polarguide.core.records import option_name
 from polarguide.core.text import decimals, whole_number
 from polarguide.geometry.polarizer import ANGLES
@@ -38,12 +38,10 @@ class PictureSettings(SampledOptions):
     """Settings of sources whose pictures are developed from camera files.
 
     Attributes:
-        white_balance: none, gray (the mean color becomes gray), or gains of R, G and B such as 1.9,1,1.6.
         precision: source rounds the intensities to less than a fifth of a step of the camera's values. full keeps 16
             bits in larger files.
     """
 
-    white_balance: str = "none"
     precision: Literal["source", "full"] = "source"
 
 
@@ -118,7 +116,6 @@ class PrepareSettings(RawOptions, MosaicSettings, SinglesSettings):
             more than 100 pictures with consecutive numbers.
         sfm_pictures: Pictures for SfM. The photograph, or the minimum over the angles, which has less glare.
         intrinsics: fx,fy,cx,cy (and k1,k2,p1,p2) of all developed pictures, for SfM. By default, they are estimated.
-        refine_intrinsics: Let SfM refine the specified focal lengths and distortion.
         masks: Folder of object masks named like the views. SfM uses only their white parts.
         seed: Seed of SfM.
     """
@@ -129,7 +126,6 @@ class PrepareSettings(RawOptions, MosaicSettings, SinglesSettings):
     matching: Literal["auto", "exhaustive", "sequential"] = "auto"
     sfm_pictures: Literal["photograph", "minimum"] = "photograph"
     intrinsics: str | None = None
-    refine_intrinsics: bool = False
     masks: Path | None = None
     seed: Annotated[int, Meta(ge=0, lt=2**31)] = 0
 
@@ -140,33 +136,24 @@ class PrepareSettings(RawOptions, MosaicSettings, SinglesSettings):
             PolarguideError: a value is out of range.
         """
         self.require_valid()
-        white_gains(self.white_balance)
-        if self.analyzers is not None and self.calibration.gains is not None:
-            raise PolarguideError(
-                "calibration (gains)",
-                expected="no gains, because the analyzers of polarguide calibrate contain the gains of every pixel",
-                found=str(self.calibration.gains),
-                remedy="Remove one of the two.",
-            )
-        if self.shots_per_view is not None and self.angles is None:
-            raise PolarguideError(
-                "--shots-per-view",
-                expected="the angles of the shots of each view in --angles, or --angles unknown or none",
-                found="no --angles",
-                remedy="Specify both, such as --angles 0,45,90,135 --shots-per-view 4.",
-            )
+        require(
+            self.analyzers is None or self.calibration.gains is None,
+            "calibration (gains)",
+            expected="no gains, because the analyzers of polarguide calibrate contain the gains of every pixel",
+            found=str(self.calibration.gains),
+            remedy="Remove one of the two.",
+        )
+        require(
+            self.shots_per_view is None or self.angles is not None,
+            "--shots-per-view",
+            expected="the angles of the shots of each view in --angles, or --angles unknown or none",
+            found="no --angles",
+            remedy="Specify both, such as --angles 0,45,90,135 --shots-per-view 4.",
+        )
         if self.intrinsics is not None:
             known_intrinsics(self.intrinsics)
-        elif self.refine_intrinsics:
-            raise PolarguideError(
-                "--refine-intrinsics",
-                expected="initial values in --intrinsics",
-                found="no --intrinsics",
-                remedy="Remove the option: unknown intrinsics are always estimated.",
-            )
         return replace(
             self,
-            white_balance="gray" if self.white_balance == "grey" else self.white_balance,
             dark_frame=_absolute(self.dark_frame),
             analyzers=_absolute(self.analyzers),
             angles=os.path.realpath(self.angles)
@@ -214,13 +201,13 @@ class CalibrationOptions:
 
     def _order(self) -> tuple[int, ...] | None:
         angles = [whole_number(part.strip()) for part in (self.order or "").split(",")]
-        if self.order is not None and (None in angles or len(angles) != len(ANGLES)):
-            raise PolarguideError(
-                "--order",
-                expected="four angles such as 90,45,0,135",
-                found=repr(self.order),
-                remedy="List the angles of the pictures named 0, 45, 90 and 135, in this order.",
-            )
+        require(
+            self.order is None or (None not in angles and len(angles) == len(ANGLES)),
+            "--order",
+            expected="four angles such as 90,45,0,135",
+            found=repr(self.order),
+            remedy="List the angles of the pictures named 0, 45, 90 and 135, in this order.",
+        )
         return None if self.order is None else tuple(angle for angle in angles if angle is not None)
 
     def analyzers(self) -> Path | None:
@@ -249,42 +236,21 @@ def settings_of_format(settings: PrepareSettings, kind: str) -> GainOptions:
             remedy="Remove the option, or choose another --format.",
         )
     calibration = settings.calibration
-    if kind == "singles" and (calibration.gains is not None or calibration.order != ANGLES):
-        raise PolarguideError(
-            "calibration (gains, order)",
-            expected="only sense and zero in the calibration of single shots",
-            found=f"gains {calibration.gains}, order {calibration.order}",
-            remedy="List the angle and gain of every shot in angles.csv.",
-        )
-    if kind not in ("mosaic", "filter", "pisr") and settings.calibration.gains is not None:
-        raise PolarguideError(
-            "calibration (gains)",
-            expected=f"no gains for the format {kind}, whose four intensities are computed from Stokes vectors",
-            found=str(settings.calibration.gains),
-            remedy="Remove the gains; order, sense and zero apply.",
-        )
+    require(
+        kind != "singles" or (calibration.gains is None and calibration.order == ANGLES),
+        "calibration (gains, order)",
+        expected="only sense and zero in the calibration of single shots",
+        found=f"gains {calibration.gains}, order {calibration.order}",
+        remedy="List the angle and gain of every shot in angles.csv.",
+    )
+    require(
+        kind in ("mosaic", "filter", "pisr") or settings.calibration.gains is None,
+        "calibration (gains)",
+        expected=f"no gains for the format {kind}, whose four intensities are computed from Stokes vectors",
+        found=str(settings.calibration.gains),
+        remedy="Remove the gains; order, sense and zero apply.",
+    )
     return owner(**{f.name: getattr(settings, f.name) for f in dataclasses.fields(owner)})
-
-
-def white_gains(text: str) -> tuple[float, float, float] | None:
-    """Parse the gains of R, G and B from ``--white-balance``.
-
-    Return None for "gray", whose gains are measured in the pictures.
-
-    Raises:
-        PolarguideError: the text is invalid.
-    """
-    if text in ("none", "gray", "grey"):
-        return (1.0, 1.0, 1.0) if text == "none" else None
-    gains = decimals(text)
-    if len(gains) != 3 or not all(0.05 <= gain <= 20 for gain in gains):
-        raise PolarguideError(
-            "--white-balance",
-            expected="none, gray, or three gains from 0.05 to 20 such as 1.9,1,1.6",
-            found=repr(text),
-            remedy="Measure the gains in a picture of a gray card.",
-        )
-    return gains[0], gains[1], gains[2]
 
 
 def known_intrinsics(text: str) -> tuple[str, tuple[float, ...]]:
@@ -298,13 +264,13 @@ def known_intrinsics(text: str) -> tuple[str, tuple[float, ...]]:
         PolarguideError: the text is invalid.
     """
     numbers = decimals(text)
-    if len(numbers) not in (4, 8) or not all(map(math.isfinite, numbers)) or min(numbers[:4]) <= 0:
-        raise PolarguideError(
-            "--intrinsics",
-            expected="fx,fy,cx,cy or fx,fy,cx,cy,k1,k2,p1,p2 in pixels of the developed pictures",
-            found=repr(text),
-            remedy="Specify four or eight numbers; the center of the first pixel is at 0.5.",
-        )
+    require(
+        len(numbers) in (4, 8) and all(map(math.isfinite, numbers)) and min(numbers[:4]) > 0,
+        "--intrinsics",
+        expected="fx,fy,cx,cy or fx,fy,cx,cy,k1,k2,p1,p2 in pixels of the developed pictures",
+        found=repr(text),
+        remedy="Specify four or eight numbers; the center of the first pixel is at 0.5.",
+    )
     return ("PINHOLE" if len(numbers) == 4 else "OPENCV"), numbers
 
 

@@ -49,7 +49,7 @@ from polarguide.core.errors import PolarguideError, PolarguideWarning
 from polarguide.core.progress import Advance
 from polarguide.geometry.polarizer import ANGLES, four_intensities
 from polarguide.preparation.journal import Factor, Measured, StoredRounding, ViewRecord, stops_record
-from polarguide.preparation.settings import MosaicSettings, white_gains
+from polarguide.preparation.settings import MosaicSettings
 
 
 @dataclass(frozen=True, eq=False)
@@ -387,7 +387,6 @@ class MosaicMeasured(Measured, kw_only=True):
         crop: numbers of columns and rows that are cut off.
         pair_ratio: ratio of I0 + I90 to I45 + I135.
         gains: gains of the four angles.
-        white_balance: gains of R, G and B.
         analyzers: calibration of the sensor.
         scale: factor of the linear values.
         rounding: steps to which stored values are rounded.
@@ -400,7 +399,6 @@ class MosaicMeasured(Measured, kw_only=True):
     pair_ratio: float | None = None
     gains: tuple[Factor, Factor, Factor, Factor]
     analyzers: dict[str, str] | None = None
-    white_balance: tuple[Factor, Factor, Factor]
     scale: Factor
     rounding: StoredRounding = tuple(EXACT)
     defects: int = 0
@@ -442,15 +440,7 @@ class MosaicSource(Source):
             else list(dataset.paths)
         )
         self.paths += [path for path in (settings.dark_frame, settings.analyzers) if path is not None]
-        self._white = white_gains(settings.white_balance)
         self._defective: NDArray[np.bool_] | None = None
-        if self._mosaics.pattern.colors is None and settings.white_balance != "none":
-            raise PolarguideError(
-                "--white-balance",
-                expected="none for a monochrome sensor",
-                found=settings.white_balance,
-                remedy="Remove the option.",
-            )
 
     @property
     def description(self) -> str:
@@ -475,7 +465,7 @@ class MosaicSource(Source):
         return Stored(size, developed=(across, down))
 
     def measure(self, advance: Advance) -> MosaicMeasured:
-        """Measure levels, gains of the angles and white balance of the capture. Each file is read once."""
+        """Measure levels and gains of the angles of the capture. Each file is read once."""
         counts = np.zeros(FULL_16 + 1, np.int64)
         container = 0
         shape = None
@@ -510,9 +500,7 @@ class MosaicSource(Source):
         if self._dataset is None:
             assert settings.sensor is not None
             require_kind(settings.sensor, np.concatenate(blocks), levels)
-        ratio, colors = self._mosaics.light_of_blocks(
-            samples, levels, self._mosaics.dark(shape[0]), cut.shape
-        )
+        ratio = self._mosaics.ratio_of_blocks(samples, levels, self._mosaics.dark(shape[0]), cut.shape)
         analyzers = self._mosaics.analyzers
         gains, notes = pair_gains(
             ratio,
@@ -525,15 +513,13 @@ class MosaicSource(Source):
         defective = int(self._defects(levels).sum())
         if defective:
             notes.append(defects_note(defective, shape[0][0] * shape[0][1]))
-        mean = np.maximum(colors.mean(axis=1) if colors.size else np.ones(3), 1e-6)
-        white = self._white or (float(mean[1] / mean[0]), 1.0, float(mean[1] / mean[2]))
-        peak = max(white) / min(gains) * settings.calibration.peak
+        peak = settings.calibration.peak / min(gains)
         if analyzers is not None:
             peak *= analyzers.peak(self._mosaics.corner, cut.shape[::-1])
         rounding = EXACT
         if settings.precision == "source" and levels.gamma == 1.0:
             # The smallest factor of a sample.
-            factor = min(white) / max(gains) / max(1.0, peak)
+            factor = 1.0 / max(gains) / max(1.0, peak)
             rounding = rounding_of(np.array([0.0, FULL_CODE * factor / ((1 << levels.bits) - 1)]))
         several = [view for view, bracket in self._brackets.items() if not bracket.single]
         merged = [self._merged(view, levels)[0].exposures for view in several]
@@ -545,7 +531,6 @@ class MosaicSource(Source):
             pair_ratio=ratio,
             gains=gains,
             analyzers=None if analyzers is None else analyzers.record(),
-            white_balance=white,
             scale=1.0 / max(1.0, peak),
             rounding=tuple(rounding),
             defects=defective,
@@ -592,13 +577,11 @@ class MosaicSource(Source):
         radiance, black, shape = self._merged(view, levels)
         saturated = radiance.clipped
         linear, (bad,) = self._mosaics.calibrated(radiance.values, saturated | black | self._defects(levels))
-        linear = linear * self._mosaics.sample_factors(
-            linear.shape, measured.gains, measured.white_balance, measured.scale
-        )
+        linear = linear * self._mosaics.sample_factors(linear.shape, measured.gains, measured.scale)
         settings = self._settings
         picture = demosaic(
             linear, bad, self._mosaics.pattern,
-            mode=settings.demosaic, interpolation=settings.interpolation, registered=settings.register,
+            mode=settings.demosaic, registered=settings.register,
         )  # fmt: skip
         largest = None if measured.bracketed else 1.0
         intensities = oriented(np.clip(picture.intensities, 0.0, largest), settings.calibration)

@@ -3,7 +3,7 @@
 A pixel at an edge shows two surfaces, and its blended depth and normal lie between them. This module averages only the
 Gaussians around the median depth, which belong to one of the surfaces.
 
-``alpha_in_front`` returns the share of a pixel in front of a given depth.
+``alpha_in_front`` renders the alpha in front of given depths.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from polarguide.geometry.camera import Camera
+from polarguide.geometry.camera import Camera, seen_at
 from polarguide.raster.cpu import finite, native_rasterizer
 from polarguide.raster.interface import Rasterize, Splats
 
@@ -63,68 +63,23 @@ def surface_picture(splats: Splats, camera: Camera) -> SurfacePicture:
     return SurfacePicture(directions, depth[..., 0])
 
 
-SLABS = 31
-"""Number of depths that one pass of ``alpha_in_front`` resolves.
-
-With one more channel for the space behind them, they use all channels of a rasterizer.
-"""
-PASSES = 4
-"""Number of passes of ``alpha_in_front``."""
-
-
 @torch.no_grad()
 def alpha_in_front(splats: Splats, camera: Camera, depth: Tensor, rasterize: Rasterize) -> Tensor:
-    """Return the share of each pixel's blending weights that belongs to Gaussians in front of a depth.
+    """Return the alpha of the Gaussians whose centers lie in front of the depth at their pixel.
 
-    At the median depth of a pixel, this share is one half. The Gaussians are sorted into slabs of depth with one
-    channel for each slab. A rasterizer then returns the share at the ends of the slabs. A pixel is finished if the
-    shares at both ends of its slab lie on the same side of one half, or if its depth lies at an end. Each pass chooses
-    slabs by the depths of the unfinished pixels. After the last pass, the share of an unfinished pixel is interpolated
-    linearly between the ends of its slab. The slab is then at most a few thousandths of its depth wide.
+    Gaussians with centers outside the picture, or at pixels without a depth, do not count.
 
     Args:
         splats: the Gaussians; features are ignored.
         camera: the view.
-        depth: [H, W] camera depths. Pixels with a depth of 0 or less are skipped.
+        depth: [H, W] camera depths; 0 or less for pixels without a depth.
         rasterize: rasterizer of the backend.
 
     Returns:
-        Shares [H, W] in [0, 1]; 0 without Gaussians and for skipped pixels.
+        Alpha [H, W] in [0, 1]; 0 without Gaussians.
     """
     pose = camera.pose(splats.means.dtype, splats.means.device)
-    places = ((splats.means - pose.center) @ pose.rotation[2])[:, None]
-    covered = (depth > 0).cpu()
-    limit = depth.to(splats.means.device, splats.means.dtype)
-    low, high, total = (torch.zeros_like(limit) for _ in range(3))
-    start = torch.zeros_like(limit)
-    end = torch.full_like(limit, torch.inf)
-    open_pixels = covered
-    for _ in range(PASSES):
-        if not bool(open_pixels.any()):
-            break
-        ends = _spread(limit.cpu()[open_pixels]).to(limit)
-        slab = torch.searchsorted(ends, places.contiguous(), right=True)
-        features = torch.zeros(len(places), len(ends) + 1, dtype=limit.dtype, device=limit.device)
-        features.scatter_(1, slab, 1.0)
-        weights = rasterize(splats._replace(features=features), camera).features
-        upto = torch.cat((torch.zeros_like(weights[..., :1]), weights.cumsum(dim=-1)), dim=-1)
-        bounds = torch.cat((ends.new_zeros(1), ends, ends.new_full((1,), torch.inf)))
-        at = torch.searchsorted(ends, limit, right=True)[..., None]
-        now = open_pixels.to(limit.device)
-        for values, bound in ((low, upto.gather(-1, at)), (high, upto.gather(-1, at + 1))):
-            values[now] = bound[..., 0][now]
-        start[now], end[now] = bounds[at[..., 0]][now], bounds[at[..., 0] + 1][now]
-        total[now] = upto[..., -1][now]
-        half = total / 2
-        undecided = (low < half) & (high >= half) & (limit > start) & (end > start * (1 + 1e-3))
-        open_pixels = covered & undecided.cpu()
-    along = torch.where(end.isfinite(), (limit - start) / (end - start).clamp(min=1e-12), 0.0)
-    share = (low + along * (high - low)) / total.clamp(min=1e-12)
-    return torch.where(covered.to(total.device) & (total > 0), share.clamp(0, 1), 0.0)
-
-
-def _spread(depths: Tensor) -> Tensor:
-    """Return at most ``SLABS`` ascending depths that divide the given depths into groups of equal size."""
-    ordered = depths.flatten().sort().values
-    places = torch.linspace(0, len(ordered) - 1, SLABS).round().long()
-    return ordered[places].unique()
+    pixels, places, inside = seen_at(splats.means - pose.center, camera)
+    front = inside & (places < depth.to(places)[pixels])
+    features = splats.features.new_zeros(len(places), 1)
+    return rasterize(Splats(*(part[front] for part in splats._replace(features=features))), camera).alpha

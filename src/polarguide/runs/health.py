@@ -1,8 +1,8 @@
 """Health and reports of a finished training, as callbacks at its end.
 
 A training can end normally although its result is unusable. Each value in ``health.json`` measures one possible fault.
-If a value exceeds its limit in ``Limits``, a warning names the views and a remedy. All values come from training views
-alone. The reports at the end cover polarizer angles and metals.
+If a value exceeds its limit in ``Limits``, a warning names the views and a remedy. No value depends on a held-out
+photograph. The reports at the end cover polarizer angles and metals.
 """
 
 from __future__ import annotations
@@ -32,11 +32,14 @@ from polarguide.core.files import write_text
 from polarguide.core.progress import Reporter
 from polarguide.core.records import read_record
 from polarguide.core.text import command
-from polarguide.gaussians.densify import Densification, free_space
+from polarguide.gaussians.initialize import camera_reach
+from polarguide.geometry.camera import Camera
+from polarguide.geometry.coverage import HAZE_DEPTH, ConfirmedSurfaces, depth_map_of_rendering
 from polarguide.optics.color import srgb_encode
 from polarguide.runs.callbacks import CURVE_POINTS, HeldOutScore
 from polarguide.runs.folder import PLY
 from polarguide.runs.model import GaussianModel, write_run_ply
+from polarguide.shading.result import RenderResult
 from polarguide.training.angles.fits import AngleFits
 from polarguide.training.angles.polarizers import REMEDY, Judgment, Polarizers, predicts_filters
 from polarguide.training.callback import Callback
@@ -148,7 +151,8 @@ class Limits:
         burned: share of burned pixels in a view. The default corresponds to a spot of 9 x 9 pixels in 320 x 240.
         exposed: difference in stops between the brightness of a view and its prediction, in any color, relative to
             other views. Cameras change exposures in steps of a third of a stop, and the default is half of a step.
-        fog: mean share of a view's light that comes from places without surfaces. Fog is most visible in dark regions.
+        haze: mean alpha of a view in free space, in front of surfaces that two training views confirm. At this value
+            the haze changes a picture by up to 5 of 255 levels.
         bare: share of pixels of a view that are holes. A hole is mostly transparent and has less than half of the
             measured light, which no filter explains.
         unseen: share of Gaussians that no view shows. They enlarge files and appear in views from other sides.
@@ -159,7 +163,7 @@ class Limits:
     brighter: float = 2.0
     burned: float = 0.001
     exposed: float = 0.17
-    fog: float = 0.01
+    haze: float = 0.02
     bare: float = 0.01
     unseen: float = 0.1
 
@@ -175,8 +179,6 @@ class ViewHealth:
         psnr: PSNR in dB of the predicted pictures of the view, as displayed. None without a valid pixel.
         beside: median PSNR in dB of the nearest views. None if there are too few views.
         burned: share of pixels that are brighter than ``Limits.brighter`` times the brightest measured intensity.
-        fog: mean share of the light that comes from places in front of all surfaces. None if the view shows no SfM
-            points.
         bare: share of pixels that are holes, see ``Limits.bare``.
         stops: median of measured over predicted light in R, G and B, in stops. None without a valid pixel.
     """
@@ -184,7 +186,6 @@ class ViewHealth:
     psnr: float | None
     beside: float | None
     burned: Share
-    fog: Share | None
     bare: Share
     stops: tuple[float, float, float] | None = None
 
@@ -197,6 +198,8 @@ class Health:
         polarization: numbers of views by the quality of their polarization data.
         warnings: messages, each with a fault, the affected views, and a remedy.
         views: values of the examined views by name.
+        haze: mean alpha in free space of the examined views and of the held-out views by name, see ``Limits.haze``.
+            Views without a confirmed surface are missing.
         brightest: largest linear intensity that was measured in the examined views.
         unseen: share of Gaussians that no examined view shows. None if a short training examined too few views.
     """
@@ -204,6 +207,7 @@ class Health:
     polarization: PolarizationSupport
     warnings: tuple[str, ...] = ()
     views: dict[str, ViewHealth] = dataclasses.field(default_factory=dict)
+    haze: dict[str, Share] = dataclasses.field(default_factory=dict)
     brightest: float | None = None
     unseen: Share | None = None
 
@@ -271,11 +275,13 @@ class TrainingEvidence:
         views: all training views, with the exposures that the training assumed.
         polarization: numbers of these views by the quality of their polarization data.
         filters: True if the recipe learns from pictures behind filters.
+        held_out: cameras of the held-out views by name.
     """
 
     views: Sequence[View]
     polarization: PolarizationSupport
     filters: bool
+    held_out: Mapping[str, Camera] = dataclasses.field(default_factory=dict)
 
     def chosen(self, steps: int) -> list[View]:
         """Return the views to examine after a training of ``steps`` steps, evenly spread; see ``TIME_SHARE``."""
@@ -301,22 +307,55 @@ def examine(
     if not views:
         return Health(evidence.polarization)
     brightest = max(map(_brightest, views))
-    cameras = [view.camera for view in views]
-    free = free_space(points, cameras, Densification.free_share, Densification.free_quantile)
+    centers = torch.stack([view.camera.center for view in evidence.views]).numpy()
+    middle, reach = camera_reach(points.double().numpy() if len(points) else centers, centers)
+    center = torch.from_numpy(middle)
     by_view = {}
     radii = []
+    depths = []
     with reporter.track("checking the result", len(views)) as advance:
-        for view, near in zip(views, free.radii.tolist(), strict=True):
-            facts, own_radii = _examine_view(model, view, LIMITS.brighter * brightest, near, evidence.filters)
-            by_view[view.name] = facts
-            radii.append(own_radii)
+        for view in views:
+            result = model.render(view.camera, depth=True, surface=True)
+            by_view[view.name] = _examine_view(
+                model, view, result, LIMITS.brighter * brightest, evidence.filters
+            )
+            radii.append(result.training["radii"])
+            depths.append(
+                depth_map_of_rendering(view.camera, result.depth, result.alpha, center, reach).on_grid()
+            )
             advance(len(by_view))
+    cameras = {**{view.name: view.camera for view in views}, **evidence.held_out}
     for name, psnr in _neighbor_psnr(views, {name: facts.psnr for name, facts in by_view.items()}).items():
         by_view[name] = dataclasses.replace(by_view[name], beside=psnr)
     unseen = None
     if len(views) == min(MOST_VIEWS, len(evidence.views)):  # a part of the views would miss visible Gaussians
         unseen = float((torch.stack(radii).amax(dim=0) <= 0).float().mean())
-    return Health(evidence.polarization, tuple(warnings_of(by_view, unseen)), by_view, brightest, unseen)
+    haze = haze_of_views(model, cameras, ConfirmedSurfaces(depths))
+    warnings = tuple(warnings_of(by_view, unseen, haze))
+    return Health(evidence.polarization, warnings, by_view, haze, brightest, unseen)
+
+
+def haze_of_views(
+    model: GaussianModel, cameras: Mapping[str, Camera], surfaces: ConfirmedSurfaces
+) -> dict[str, float]:
+    """Return the mean alpha in free space of each view, over pixels with a confirmed surface.
+
+    Args:
+        model: the trained model.
+        cameras: cameras of the views by name.
+        surfaces: surfaces that training views confirm.
+
+    Returns:
+        Alpha in [0, 1] by name. Views without a confirmed surface are missing.
+    """
+    haze = {}
+    for name, camera in cameras.items():
+        nearest = surfaces.nearest(camera)
+        confirmed = nearest > 0
+        if bool(confirmed.any()):
+            alpha = model.alpha_in_front(camera, HAZE_DEPTH * nearest).cpu()
+            haze[name] = float(alpha[confirmed].mean())
+    return haze
 
 
 def _counted(view: View) -> Tensor:
@@ -331,20 +370,19 @@ def _brightest(view: View) -> float:
 
 
 def _examine_view(
-    model: GaussianModel, view: View, limit: float, near: float, filters: bool
-) -> tuple[ViewHealth, Tensor]:
-    """Return the measured values of a view, and the radii [N] of the Gaussians in it.
+    model: GaussianModel, view: View, result: RenderResult, limit: float, filters: bool
+) -> ViewHealth:
+    """Return the measured values of a view.
 
     Args:
         model: the trained model.
         view: the view.
+        result: its rendering.
         limit: intensity above which a pixel is burned.
-        near: depth that is nearer than all surfaces. 0 means unknown.
         filters: True if the model predicts pictures behind filters.
     """
     local = view.to(model.device)
     camera = view.camera
-    result = model.render(camera)
     counted = _counted(local)
     stokes = model.stokes(result, camera) if filters else None
     measured, predicted = _compared(local, result.final, stokes)
@@ -355,12 +393,8 @@ def _examine_view(
     unlit = black_pixels(view).to(model.device) | ~counted
     inner = max_pool2d(unlit.float()[None], 3, stride=1, padding=1)[0] == 0  # edges are blended
     bare = inner & (result.alpha < 0.5) & (light < photograph / 2)
-    fog = None
-    if near > 0:
-        depth = torch.full_like(result.alpha, near)
-        fog = float((model.alpha_in_front(camera, depth) * result.alpha).mean().clamp(0, 1))
     stops = _stops(measured.mean(dim=0), predicted.mean(dim=0), counted)
-    return ViewHealth(psnr, None, _share(burned), fog, _share(bare), stops), result.training["radii"]
+    return ViewHealth(psnr, None, _share(burned), _share(bare), stops)
 
 
 def _psnr(predicted: Tensor, measured: Tensor, counted: Tensor) -> float | None:
@@ -418,12 +452,18 @@ def _share(pixels: Tensor) -> float:
     return float(pixels.float().mean())
 
 
-def warnings_of(views: Mapping[str, ViewHealth], unseen: float | None, limits: Limits = LIMITS) -> list[str]:
+def warnings_of(
+    views: Mapping[str, ViewHealth],
+    unseen: float | None,
+    haze: Mapping[str, float],
+    limits: Limits = LIMITS,
+) -> list[str]:
     """Return the warnings, the most severe first.
 
     Args:
         views: values of the examined views by name.
         unseen: share of Gaussians that no view shows. None means unknown.
+        haze: mean alpha in free space of training views and held-out views by name.
         limits: limits of the values.
     """
     warnings = []
@@ -455,12 +495,12 @@ def warnings_of(views: Mapping[str, ViewHealth], unseen: float | None, limits: L
             f"training views brighter or darker than the result predicts, or of other colors (stops: {stops}): their "
             "exposure or white balance differs and was not corrected. Leave them out, or prepare with --gains auto."
         )
-    fog = {name: view.fog for name, view in views.items() if view.fog is not None and view.fog > limits.fog}
-    if fog:
+    hazy = {name: alpha for name, alpha in haze.items() if alpha > limits.haze}
+    if hazy:
         warnings.append(
-            f"fog in front of the cameras of {_worst(fog, 'of the light')}, where no surface can be. New views "
-            "near these cameras show it. Add views from there. For a subject without surroundings, train with "
-            "--background black or masked."
+            f"haze in front of {_worst(hazy, 'opacity')}: Gaussians lie in space through which training views see "
+            "surfaces. Add views from these sides, or train with another --seed. For a subject without surroundings, "
+            "train with --background black or masked."
         )
     if bare:
         warnings.append(
@@ -556,7 +596,8 @@ class HealthCheck(Callback[TrainingLoop]):
         filters = predicts_filters(recipe)
         priors = any(stage.weights.priors for stage in recipe.stages)
         support = PolarizationSupport.of(views, polarizers.judgments(), measured=priors, fitted=filters)
-        evidence = TrainingEvidence(views, support, filters=filters)
+        held_out = {view.name: view.camera for view in context.scene.test_views}
+        evidence = TrainingEvidence(views, support, filters=filters, held_out=held_out)
         model = GaussianModel.of(loop.state, recipe, context.settings, context.backend)
         health = examine(model, evidence, context.scene.points, context.settings.steps, context.reporter)
         for warning in health.warnings:

@@ -139,7 +139,7 @@ class GaussianModel:
 
     @torch.no_grad()
     def alpha_in_front(self, camera: Camera, depth: Tensor) -> Tensor:
-        """Return the share of each pixel's alpha in front of a depth [H, W], see ``raster.surface``."""
+        """Return the alpha [H, W] in front of the depths [H, W], see ``raster.surface``."""
         drawn = splats(self.state.gaussians)
         footprints = self.state.footprints
         if footprints is not None:

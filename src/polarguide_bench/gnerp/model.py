@@ -80,15 +80,14 @@ class FieldModel:
 
     @torch.no_grad()
     def alpha_in_front(self, camera: Camera, depth: Tensor) -> Tensor:
-        """Return the share [H, W] of each pixel's opacity in front of a depth [H, W], or 0 at depths up to 0."""
+        """Return the opacity [H, W] in front of the depths [H, W]; 0 at depths up to 0."""
         rays = camera.rays(device=self.device).view(-1, 3)
         far = depth.to(rays).flatten() / rays[:, 2] / self.field.region.unit
-        shares = []
+        opacities = []
         for (origin, direction), reach in zip(self._rays(camera), far.split(CHUNK), strict=True):
             marched = march(self.field, origin, direction, self.recipe.sampling)
-            near = (marched.weights * (marched.along < reach[:, None])).sum(dim=1)
-            shares.append(near / marched.opacity.clamp(min=1e-6))
-        return torch.cat(shares).view(depth.shape)
+            opacities.append((marched.weights * (marched.along < reach[:, None])).sum(dim=1))
+        return torch.cat(opacities).view(depth.shape)
 
     @torch.no_grad()
     def lattice(self, axes: tuple[Tensor, Tensor, Tensor]) -> Tensor:

@@ -74,7 +74,7 @@ def test_a_scene_without_ground_truth_has_its_stokes_error(changed: tuple[Path, 
     assert (record["objects"], record["materials"]) == ({}, {})
     for key in (
         "depth_error_median_percent",
-        "haze_alpha",
+        "haze_true",
         "depth_beyond",
         "mesh_fscore_1",
         "alpha_outside",

@@ -95,7 +95,7 @@ def test_stokes_error_without_true_masks_is_over_the_whole_picture_or_the_users_
     assert got["stokes_error"] == pytest.approx(stokes_by_loop(views[0], predicted, counts), rel=1e-6)
     for key in (
         "depth_error_median_percent",
-        "haze_alpha",
+        "haze_true",
         "depth_beyond",
         "coverage_error",
         "alpha_outside",
@@ -157,7 +157,8 @@ def test_haze_is_the_mean_alpha_in_front_of_the_surface():
     smooth = without_jumps(VIEW.ground_truth.depth) & ~VIEW.invalid
     counted = [float(in_front[p]) for p in PIXELS if smooth[p]]
     assert 0 < len(counted) < len(PIXELS)
-    assert score(VIEW, FACTS)["haze_alpha"] == pytest.approx(statistics.mean(counted))
+    assert score(VIEW, FACTS)["haze_true"] == pytest.approx(statistics.mean(counted))
+    assert score(VIEW, FACTS)["haze_free"] is None
 
 
 def test_depth_beyond_counts_what_is_drawn_from_behind_the_surface():

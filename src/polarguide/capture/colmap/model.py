@@ -23,7 +23,7 @@ from torch import Tensor
 from polarguide.core.errors import PolarguideError, require
 from polarguide.core.files import read_file
 from polarguide.core.text import canonical, decimal_comma, listed
-from polarguide.geometry.camera import FARTHEST, LENS, Camera, can_be_lens, quaternion
+from polarguide.geometry.camera import FARTHEST, LENS, Camera, can_be_lens, quaternion, seen_at
 
 MODELS = {
     "SIMPLE_PINHOLE": (0, 3), "PINHOLE": (1, 4), "SIMPLE_RADIAL": (2, 4), "RADIAL": (3, 5), "OPENCV": (4, 8),
@@ -103,7 +103,7 @@ _LONGEST_NAME = 4096
 def check_model_files(folder: Path, kind: str) -> None:
     """Check the files of a model before pycolmap reads them. Missing files are skipped.
 
-    pycolmap checks text files itself, except for decimal commas and the range of colors.
+    pycolmap checks text files itself, except for decimal commas.
 
     Args:
         folder: folder of the model.
@@ -139,8 +139,6 @@ def check_model_files(folder: Path, kind: str) -> None:
                 found=comma,
                 remedy="Write the model again with a locale that uses decimal points (LC_NUMERIC=C).",
             )
-        elif name == "points3D":
-            found = _invalid_color(data)
         if found is not None:
             raise PolarguideError(
                 path,
@@ -161,21 +159,6 @@ def _decimal_comma(data: bytes) -> str:
         if comma:
             return f"a decimal comma, {comma} in line {number}"
     return ""
-
-
-def _invalid_color(data: bytes) -> str | None:
-    """Describe the first color in ``points3D.txt`` that is not in the range 0 to 255. Return None if all are valid.
-
-    pycolmap reads such a color modulo 256 without an error.
-    """
-    for number, line in enumerate(data.splitlines(), 1):
-        cells = line.split(None, 7)[4:7]
-        if line[:1] != b"#" and any(
-            cell.lstrip(b"-").isdigit() and not (len(cell) <= 3 and 0 <= int(cell) <= 255) for cell in cells
-        ):
-            color = ", ".join(cell.decode("ascii", "replace")[:20] for cell in cells)
-            return f"a color of {color} in line {number}, outside of 0 to 255"
-    return None
 
 
 def _cameras(data: bytes) -> int:
@@ -651,8 +634,6 @@ def _points_of(model: Any) -> tuple[Tensor, Tensor, tuple[tuple[int, ...], ...],
 
 _SAMPLES = 2000
 """Largest number of points that are tested for visibility."""
-_MARGIN = 1.0
-"""Margin around a picture in which a point still counts as visible, relative to the size of the picture."""
 
 
 def unseen_points(points: Tensor, cameras: Sequence[Camera]) -> list[str]:
@@ -660,22 +641,9 @@ def unseen_points(points: Tensor, cameras: Sequence[Camera]) -> list[str]:
     if not cameras or not len(points):
         return []
     places = points[:: max(1, len(points) // _SAMPLES)].to(torch.float64)
-    if any(_sees(camera, places) for camera in cameras):
+    if any(bool(seen_at(places - camera.center, camera)[2].any()) for camera in cameras):
         return []
     return [
         f"None of the {len(points)} points of the COLMAP model is in the field of view of one of the {len(cameras)} "
         "cameras: points and poses are of different models, or one of them is rotated."
     ]
-
-
-def _sees(camera: Camera, places: Tensor) -> bool:
-    """Return True if some point is in front of a camera, and inside its picture or the margin around it."""
-    local = places @ camera.rotation.to(torch.float64).T + camera.translation.to(torch.float64)
-    local = local[local[:, 2] > 0]
-    x = camera.fx * local[:, 0] / local[:, 2] + camera.cx
-    y = camera.fy * local[:, 1] / local[:, 2] + camera.cy
-    across = _MARGIN * camera.width
-    down = _MARGIN * camera.height
-    return bool(
-        ((x >= -across) & (x <= camera.width + across) & (y >= -down) & (y <= camera.height + down)).any()
-    )

@@ -331,7 +331,6 @@ def reconstruct(
     reporter: Reporter,
     untried: str,
     intrinsics: tuple[str, tuple[float, ...]] | None = None,
-    refine: bool = True,
     lenses: Mapping[str, Lens] | None = None,
 ) -> Path:
     """Estimate poses, intrinsics and points from ``folder/images/<view>.png``.
@@ -348,7 +347,6 @@ def reconstruct(
         reporter: reporter of progress and messages.
         untried: options that may connect more views, which an error message suggests.
         intrinsics: known camera model and parameters of all pictures, or None.
-        refine: if True, known intrinsics are refined.
         lenses: lenses by view from EXIF.
 
     Returns:
@@ -382,7 +380,7 @@ def reconstruct(
         matching=matching, seed=seed, reporter=reporter, cameras=cameras, lenses=lenses,
         masks=folder / "masks",
     )  # fmt: skip
-    free = intrinsics is None or refine
+    free = intrinsics is None
     models = _map(database, images, trial, len(sizes), seed, reporter, free, weak=False)
     if _registered(models) < _ENOUGH_SHARE * len(sizes):
         reporter.say(

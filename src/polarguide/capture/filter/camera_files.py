@@ -26,14 +26,14 @@ from polarguide.capture.calibration import Calibration
 from polarguide.capture.formats.headers import (
     LARGEST_PIXELS,
     ORIENTATION,
-    heif_head,
+    heif_orientation,
     heif_tags,
     opened_picture,
     picture_kind,
     png_chunk,
 )
 from polarguide.capture.formats.pictures import array_kind, read_picture
-from polarguide.core.errors import PolarguideError, optional_import
+from polarguide.core.errors import PolarguideError, optional_import, require
 from polarguide.core.files import read_file
 from polarguide.core.text import listed
 
@@ -49,14 +49,12 @@ def is_camera_raw(path: Path) -> bool:
 
 
 def read_camera_raw(
-    path: Path, gains: tuple[float, float, float], *, opener: Callable[[io.BytesIO], Any] | None = None
+    path: Path, *, opener: Callable[[io.BytesIO], Any] | None = None
 ) -> tuple[NDArray[np.uint16], int]:
     """Develop a camera raw file.
 
     Args:
         path: the file.
-        gains: gains of R, G and B. They are divided by the smallest gain, so a saturated sensor gives the full scale of
-            the picture.
         opener: function that opens the content of a file instead of ``rawpy.imread``, or None.
 
     Returns:
@@ -70,20 +68,20 @@ def read_camera_raw(
         if raw.sizes.raw_width * raw.sizes.raw_height > LARGEST_PIXELS:
             raise ValueError(f"{raw.sizes.raw_width}x{raw.sizes.raw_height} pixels")
         flip = int(raw.sizes.flip)  # user_flip overwrites it
-        pixels = np.asarray(raw.postprocess(**libraw_parameters(gains)))
+        pixels = np.asarray(raw.postprocess(**libraw_parameters()))
         reached = float(_FULL)
         if raw.raw_type.name == "Stack":
             # In files without a mosaic (linear DNG, such as ProRAW), LibRaw subtracts the black levels of three
             # channels from the samples, but the black level of a fourth channel, 0, from the white level.
             black = raw.black_level_per_channel
             reached = float((raw.white_level - max(black[:3])) / (raw.white_level - min(black)) * _FULL)
-    if pixels.ndim != 3 or pixels.shape[2] != 3 or pixels.dtype != np.uint16:
-        raise PolarguideError(
-            path,
-            expected="a camera raw file with three colors",
-            found=array_kind(pixels),
-            remedy="Develop it to 16-bit linear TIFF.",
-        )
+    require(
+        pixels.ndim == 3 and pixels.shape[2] == 3 and pixels.dtype == np.uint16,
+        path,
+        expected="a camera raw file with three colors",
+        found=array_kind(pixels),
+        remedy="Develop it to 16-bit linear TIFF.",
+    )
     # The white level becomes 65535, which marks saturation. LibRaw rounds down.
     if reached < _FULL:
         pixels = np.minimum(np.rint(pixels * np.float32(_FULL / reached)), _FULL).astype(np.uint16)
@@ -132,9 +130,8 @@ def _message(error: Exception) -> str:
     return (text.strip().splitlines() or [type(error).__name__])[0]
 
 
-def libraw_parameters(gains: tuple[float, float, float]) -> dict[str, Any]:
+def libraw_parameters() -> dict[str, Any]:
     """Return the settings for LibRaw. The keys are the names of the arguments of ``rawpy.Params``."""
-    red, green, blue = (gain / min(gains) for gain in gains)
     settings: dict[str, Any] = {
         "gamma": (1.0, 1.0),
         "output_bps": 16,
@@ -144,7 +141,7 @@ def libraw_parameters(gains: tuple[float, float, float]) -> dict[str, Any]:
         "adjust_maximum_thr": 0.0,
         "use_camera_wb": False,
         "use_auto_wb": False,
-        "user_wb": [red, green, blue, green],
+        "user_wb": [1.0, 1.0, 1.0, 1.0],
         "user_flip": 0,
         "median_filter_passes": 0,
     }
@@ -182,8 +179,7 @@ def orientation(data: bytes) -> int:
     The rotation of a HEIC file is read from its header, because its tag is informative only.
     """
     if picture_kind(data) == "HEIF":
-        head = heif_head(data)
-        return 1 if head is None else head.orientation
+        return heif_orientation(data)
     value = tags_of(data).get(ORIENTATION)
     return value if isinstance(value, int) and 1 <= value <= 8 else 1
 

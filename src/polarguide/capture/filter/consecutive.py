@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from polarguide.capture.filter.camera_files import is_camera_raw, read_camera_raw
 from polarguide.capture.formats.pictures import decode_picture, read_picture
 from polarguide.capture.write import write_png_file
-from polarguide.core.errors import PolarguideError
+from polarguide.core.errors import require
 from polarguide.core.files import make_folder, write_text
 from polarguide.core.progress import Advance, Reporter
 from polarguide.geometry.polarizer import ANGLES
@@ -70,7 +70,7 @@ def numbered_like_angles(paths: Sequence[Path]) -> list[Path]:
 def _edges(path: Path) -> NDArray[np.float32]:
     """Return a small gray picture without low frequencies, with a standard deviation of 1."""
     raw = is_camera_raw(path)
-    pixels = read_camera_raw(path, (1.0, 1.0, 1.0))[0] if raw else decode_picture(path, read_picture(path))
+    pixels = read_camera_raw(path)[0] if raw else decode_picture(path, read_picture(path))
     small = cv2.resize(
         np.sqrt(pixels.mean(axis=2, dtype=np.float32)), (_SIDE, _SIDE), interpolation=cv2.INTER_AREA
     )
@@ -107,20 +107,24 @@ def extract_frames(video: Path, folder: Path, reporter: Reporter) -> int:
     done = folder / _RECORD
     if done.is_file() and done.read_text() == record:
         return len(list(folder.glob("frame_*.png")))
-    if folder.exists() and any(folder.iterdir()) and not done.is_file():
-        raise PolarguideError(
-            folder, expected="a new folder for the frames of the video", found="other files",
-            remedy="Choose another --out: the folder of the frames is next to it.",
-        )  # fmt: skip
+    require(
+        not folder.exists() or not any(folder.iterdir()) or done.is_file(),
+        folder,
+        expected="a new folder for the frames of the video",
+        found="other files",
+        remedy="Choose another --out: the folder of the frames is next to it.",
+    )
     reader = cv2.VideoCapture(str(video))
     total = int(reader.get(cv2.CAP_PROP_FRAME_COUNT))
     rate = reader.get(cv2.CAP_PROP_FPS) or 25.0
     wanted = int(np.clip(FRAMES_A_SECOND * total / rate, LEAST_FRAMES, MOST_FRAMES))
-    if total < 3:
-        raise PolarguideError(
-            video, expected="a video that OpenCV reads", found=f"{max(total, 0)} frames",
-            remedy="Convert it to H.264 in .mp4, or save its frames as pictures.",
-        )  # fmt: skip
+    require(
+        total >= 3,
+        video,
+        expected="a video that OpenCV reads",
+        found=f"{max(total, 0)} frames",
+        remedy="Convert it to H.264 in .mp4, or save its frames as pictures.",
+    )
     make_folder(folder)
     write_text(done, "unfinished\n")
     for old in folder.glob("frame_*.png"):

@@ -11,7 +11,6 @@ import itertools
 import logging
 import math
 import re
-import struct
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -19,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 import tifffile
-from PIL import Image
+from PIL import Image, ImageCms
 from PIL.ExifTags import Base
 
 from polarguide.capture import checks
@@ -46,10 +45,9 @@ _CHARACTERISTICS = {
 }
 """Exponent of each transfer characteristic of ITU-T H.273. Those for television are treated like sRGB."""
 _UNSPECIFIED = 2
-
-_CURVES = (b"rTRC", b"kTRC")
-_PARAMETERS = {0: 1, 1: 3, 2: 4, 3: 5, 4: 7}
 _MIDDLE = 0.5
+_GRAY = 128
+"""8-bit value near half of full scale, whose light a profile gives."""
 
 
 @dataclass(frozen=True)
@@ -126,44 +124,21 @@ def _of_tiff(data: bytes) -> tuple[bytes | None, Encoding | None]:
 
 
 def profile_exponent(profile: bytes) -> float | None:
-    """Return the exponent of an ICC profile, see ``Encoding``. Return None for other curves and damaged profiles."""
-    try:
-        decoded = _decoded_middle(profile)
-    except (struct.error, OverflowError, ValueError, IndexError):
-        return None
-    if decoded is None or not 0 < decoded < 1:
-        return None
-    return math.log(decoded) / math.log(_MIDDLE)
+    """Return the exponent of an ICC profile, see ``Encoding``. Return None for a damaged profile.
 
-
-def _decoded_middle(profile: bytes) -> float | None:
-    """Return the value at half of full scale of the red or gray curve in an ICC profile.
-
-    The standard ICC.1 describes the curves as curveType and parametricCurveType.
+    The profile converts a gray to CIE L*, which is ``116 Y^(1/3) - 16`` for the luminance Y.
     """
-    (count,) = struct.unpack_from(">I", profile, 128)
-    entries = [struct.unpack_from(">4sII", profile, 132 + 12 * number) for number in range(min(count, 100))]
-    at = next((at for name, at, _ in entries if name in _CURVES), None)
-    if at is None:
-        return None
-    kind = profile[at : at + 4]
-    if kind == b"curv":
-        (count,) = struct.unpack_from(">I", profile, at + 8)
-        if count == 0:
-            return _MIDDLE
-        if count == 1:
-            return float(_MIDDLE ** (struct.unpack_from(">H", profile, at + 12)[0] / 256))
-        return float(struct.unpack_from(">H", profile, at + 12 + 2 * round(_MIDDLE * (count - 1)))[0]) / 65535
-    if kind != b"para":
-        return None
-    (form,) = struct.unpack_from(">H", profile, at + 8)
-    if form not in _PARAMETERS:
-        return None
-    numbers = [n / 65536 for n in struct.unpack_from(f">{_PARAMETERS[form]}i", profile, at + 12)]
-    factor, shift = numbers[1:3] if form else (1.0, 0.0)
-    # Half scale is above the linear part of all common curves.
-    raised = numbers[{2: 3, 4: 5}[form]] if form in (2, 4) else 0.0
-    return float(max(0.0, factor * _MIDDLE + shift) ** max(numbers[0], 0.1) + raised)
+    with contextlib.suppress(Exception):  # littlecms raises several kinds of errors
+        source = ImageCms.ImageCmsProfile(io.BytesIO(profile))
+        mode = "L" if source.profile.xcolor_space == "GRAY" else "RGB"
+        target = ImageCms.createProfile("LAB")
+        to_lab = ImageCms.buildTransform(source, target, mode, "LAB", ImageCms.Intent.RELATIVE_COLORIMETRIC)
+        gray = Image.new(mode, (1, 1), (_GRAY,) * len(mode))
+        lightness = float(np.asarray(ImageCms.applyTransform(gray, to_lab))[0, 0, 0]) * 100 / 255
+        luminance = ((lightness + 16) / 116) ** 3
+        if 0 < luminance < 1:
+            return math.log(luminance) / math.log(_GRAY / 255)
+    return None
 
 
 LOSSY = "JPEG, WebP or HEIC"

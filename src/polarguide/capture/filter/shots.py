@@ -37,7 +37,7 @@ from polarguide.capture.sensor.pattern import Levels
 from polarguide.capture.sensor.raw_file import RAW_SUFFIXES
 from polarguide.capture.view import ANGLES
 from polarguide.capture.view_reader import require_alike
-from polarguide.core.errors import PolarguideError
+from polarguide.core.errors import PolarguideError, require
 from polarguide.core.text import canonical, listed
 
 SHOT_SUFFIXES = (*SUFFIXES, *CAMERA_RAW)
@@ -181,50 +181,45 @@ def require_four_shots(root: Path, shots: dict[str, dict[int, Path]]) -> None:
         PolarguideError: a shot is missing.
     """
     counts = [sum(angle in files for files in shots.values()) for angle in ANGLES]
-    if all(len(files) == 1 for files in shots.values()) and min(counts) == max(counts) > 0:
-        raise PolarguideError(
-            root,
-            expected="equal names of the four shots of a view in the four folders",
-            found=f"{counts[0]} files in each, all under different names ({listed(sorted(shots))})",
-            remedy="Give the shots of a view one name; docs/how-to/prepare.md has a command that numbers them.",
-        )
+    require(
+        not all(len(files) == 1 for files in shots.values()) or not min(counts) == max(counts) > 0,
+        root,
+        expected="equal names of the four shots of a view in the four folders",
+        found=f"{counts[0]} files in each, all under different names ({listed(sorted(shots))})",
+        remedy="Give the shots of a view one name; docs/how-to/prepare.md has a command that numbers them.",
+    )
     for view, files in sorted(shots.items()):
         missing = [str(angle) for angle in ANGLES if angle not in files]
-        if missing:
-            raise PolarguideError(
-                root,
-                expected=f"the shots of view {view} at 0, 45, 90 and 135 degrees",
-                found=f"none at {' and '.join(missing)}",
-                remedy="Add the file, or remove the other shots of the view. prepare --format singles accepts any.",
-            )
+        require(
+            not missing,
+            root,
+            expected=f"the shots of view {view} at 0, 45, 90 and 135 degrees",
+            found=f"none at {' and '.join(missing)}",
+            remedy="Add the file, or remove the other shots of the view. prepare --format singles accepts any.",
+        )
 
 
-def read_stack(
-    paths: Sequence[Path],
-    gains: tuple[float, float, float] = (1.0, 1.0, 1.0),
-    levels: Levels | None = None,
-) -> Shots:
+def read_stack(paths: Sequence[Path], levels: Levels | None = None) -> Shots:
     """Read the shots of a view. There may be any number of shots.
 
     Args:
         paths: files of the shots.
-        gains: gains of R, G and B for camera raw files.
         levels: levels of the stored values. The values are rescaled so that full scale is the largest value of their
             type. By default, the files already have this full scale.
 
     Raises:
         PolarguideError: a file cannot be read, or files differ in size, depth or orientation.
     """
-    pictures, codes = zip(*(_read_shot(path, gains) for path in paths), strict=True)
+    pictures, codes = zip(*map(_read_shot, paths), strict=True)
     for path, picture, code in zip(paths, pictures, codes, strict=True):
         require_alike(path, picture, paths[0], pictures[0])
-        if code != codes[0]:
-            raise PolarguideError(
-                path,
-                expected=f"EXIF orientation {codes[0]} like {paths[0].name}",
-                found=str(code),
-                remedy="Do not move the camera between the shots of a view, or export all with the same settings.",
-            )
+        require(
+            code == codes[0],
+            path,
+            expected=f"EXIF orientation {codes[0]} like {paths[0].name}",
+            found=str(code),
+            remedy="Do not move the camera between the shots of a view, or export all with the same settings.",
+        )
     return stacked(np.stack(pictures), codes[0], lossy=is_lossy(paths[0]), levels=levels)
 
 
@@ -249,10 +244,10 @@ def stacked(
     return Shots(stack, orientation, np.asarray(top >= limit), ~top.any(axis=0))
 
 
-def _read_shot(path: Path, gains: tuple[float, float, float]) -> tuple[NDArray[Any], int]:
+def _read_shot(path: Path) -> tuple[NDArray[Any], int]:
     """Read a shot, and return its stored values [H, W, 3] and its EXIF orientation."""
     if is_camera_raw(path):
-        return read_camera_raw(path, gains)
+        return read_camera_raw(path)
     data = read_picture(path)
     return decode_picture(path, data), orientation(data)
 
@@ -299,13 +294,13 @@ def find_single_shots(
             exposure, or the options contradict each other.
     """
     table = root / TABLE
-    if angles is not None and table.exists() and Path(angles).resolve() != table.resolve():
-        raise PolarguideError(
-            "--angles",
-            expected=f"no --angles with {table}, which states the angles",
-            found=angles,
-            remedy="Omit the option, or move the table to another folder.",
-        )
+    require(
+        angles is None or not table.exists() or Path(angles).resolve() == table.resolve(),
+        "--angles",
+        expected=f"no --angles with {table}, which states the angles",
+        found=str(angles),
+        remedy="Omit the option, or move the table to another folder.",
+    )
     if angles is not None and not angles.lower().endswith(".csv"):
         return _validated(root, _with_angles(root, angles, each)), []
     if angles is not None or table.exists():
@@ -321,13 +316,13 @@ def find_single_shots(
         return _validated(root, shots), []
     named = dict(zip(files, views_of_names(root, files), strict=True))
     without = [path.name for path, shot in named.items() if shot is None]
-    if without:
-        raise PolarguideError(
-            root,
-            expected="an angle in the name of every photograph",
-            found=f"{len(without)} of {len(files)} without an angle in their names ({listed(without)})",
-            remedy=NAMING,
-        )
+    require(
+        not without,
+        root,
+        expected="an angle in the name of every photograph",
+        found=f"{len(without)} of {len(files)} without an angle in their names ({listed(without)})",
+        remedy=NAMING,
+    )
     return _validated(root, [SingleShot(path, *shot) for path, shot in named.items() if shot is not None]), []
 
 
@@ -361,13 +356,13 @@ def _with_angles(root: Path, angles: str, each: int) -> list[SingleShot]:
         )
     files = list(index_shot_files(root, SHOT_SUFFIXES).values())
     period = max(each, len(repeating))
-    if len(files) % period or len(repeating) not in (1, period):
-        raise PolarguideError(
-            "--angles",
-            expected=f"a number of photographs divisible by {period}, and one angle or {period} repeating angles",
-            found=f"{len(files)} in {root} and {len(repeating)} angles",
-            remedy=f"Add or remove photographs, or list the angle of each in {TABLE}.",
-        )
+    require(
+        not len(files) % period and len(repeating) in (1, period),
+        "--angles",
+        expected=f"a number of photographs divisible by {period}, and one angle or {period} repeating angles",
+        found=f"{len(files)} in {root} and {len(repeating)} angles",
+        remedy=f"Add or remove photographs, or list the angle of each in {TABLE}.",
+    )
     repeated = [repeating[number % len(repeating)] for number in range(len(files))]
     return [
         SingleShot(path, shot_stem(files[number - number % each]), angle)
@@ -389,13 +384,13 @@ def listed_pictures(root: Path, table: Path) -> tuple[list[tuple[Line, Path]], l
     lines = read_table(table)
     rows = list(zip(lines, files_of(root, table, lines), strict=True))
     for line, path in rows:
-        if not path.resolve().is_relative_to(root.resolve()) or path.suffix.lower() not in SHOT_SUFFIXES:
-            raise PolarguideError(
-                f"{table} (line {line.number})",
-                expected=f"a picture in {root} ({', '.join(SHOT_SUFFIXES)})",
-                found=line.file,
-                remedy="Copy or convert the file, or remove the line.",
-            )
+        require(
+            path.resolve().is_relative_to(root.resolve()) and path.suffix.lower() in SHOT_SUFFIXES,
+            f"{table} (line {line.number})",
+            expected=f"a picture in {root} ({', '.join(SHOT_SUFFIXES)})",
+            found=line.file,
+            remedy="Copy or convert the file, or remove the line.",
+        )
     in_table = {path.resolve() for _, path in rows}
     return rows, [path for path in list_shot_files(root, SHOT_SUFFIXES) if path.resolve() not in in_table]
 
@@ -410,24 +405,24 @@ def _by_table(root: Path, table: Path) -> list[SingleShot]:
     shots: list[SingleShot] = []
     alone: dict[str, Path] = {}
     for line, path in rows:
-        if not path.is_file():
-            raise PolarguideError(
-                table,
-                expected=f"the file {path}",
-                found="nothing with this name",
-                remedy="Correct the name, or remove the line.",
-            )
+        require(
+            path.is_file(),
+            table,
+            expected=f"the file {path}",
+            found="nothing with this name",
+            remedy="Correct the name, or remove the line.",
+        )
         stem = shot_stem(path)
         if line.view is None and alone.setdefault(stem, path) is not path:
             raise ambiguous(root, f"one photograph called {stem}", alone[stem], path)
         shots.append(SingleShot(path, line.view or stem, line.angle, line.gain))
-    if without:
-        raise PolarguideError(
-            table,
-            expected="a line for every photograph in the folder",
-            found=f"none for {len(without)} ({listed([path.name for path in without])})",
-            remedy="Add the lines, with the angle unknown if it was not noted, or remove the photographs.",
-        )
+    require(
+        not without,
+        table,
+        expected="a line for every photograph in the folder",
+        found=f"none for {len(without)} ({listed([path.name for path in without])})",
+        remedy="Add the lines, with the angle unknown if it was not noted, or remove the photographs.",
+    )
     return shots
 
 
@@ -439,17 +434,15 @@ def _validated(root: Path, shots: list[SingleShot]) -> list[SingleShot]:
     """
     first: dict[tuple[str, object], Path] = {}
     for shot in shots:
-        if (
-            any(sign in shot.view for sign in "/\\")
-            or shot.view.startswith(".")
-            or not shot.view.isprintable()
-        ):
-            raise PolarguideError(
-                root / TABLE,
-                expected="a view name that can be a file name",
-                found=repr(shot.view),
-                remedy="Rename the view.",
-            )
+        require(
+            not any(sign in shot.view for sign in "/\\")
+            and not shot.view.startswith(".")
+            and shot.view.isprintable(),
+            root / TABLE,
+            expected="a view name that can be a file name",
+            found=repr(shot.view),
+            remedy="Rename the view.",
+        )
         if shot.angle == "unknown":
             continue
         key = (shot.view, shot.angle)  # angles that differ by 180 degrees are repetitions and valid

@@ -10,11 +10,11 @@ import contextlib
 import io
 import itertools
 import logging
+import math
 import re
 import struct
 import zlib
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from PIL.BmpImagePlugin import BmpImageFile
 from PIL.JpegImagePlugin import JpegImageFile
+from PIL.PpmImagePlugin import PpmImageFile
 from PIL.WebPImagePlugin import WebPImageFile
 
 from polarguide.core.errors import PolarguideError, optional_import
@@ -36,11 +37,10 @@ _KINDS = re.compile(
 )
 """Pattern that recognizes kinds of picture files by their first bytes."""
 TIFFS = ("TIFF", "BigTIFF")
-# The end of JPEG scan data. In the data, 0xFF is followed by 0 (a stuffed byte) or by 0xD0-0xD7 (a restart).
-_JPEG_SCAN_END = re.compile(rb"\xff[^\x00\xd0-\xd7\xff]")
+# Markers of JPEG files. In scan data, 0xFF is followed by 0 (a stuffed byte) or by 0xD0-0xD7 (a restart).
+_START_OF_SCAN = b"\xff\xda"
+_END_OF_IMAGE = b"\xff\xd9"
 ORIENTATION = 274
-# JPEG markers that no length follows: an unused marker, and restarts.
-_JPEG_ALONE = (0x01, *range(0xD0, 0xD8))
 # Largest number of scans of a progressive JPEG file. Encoders write about ten. Even an empty scan takes time to decode.
 _MOST_SCANS = 200
 LARGEST_PIXELS = 150_000_000
@@ -86,7 +86,9 @@ def declared_size(data: bytes) -> tuple[int, int] | None:
         return struct.unpack_from(">II", data, 16) if data[12:16] == b"IHDR" and len(data) >= 24 else None
     if kind in TIFFS:
         return tiff_size(io.BytesIO(data))
-    head = {"PNM": pnm_head, "HEIF": heif_head}.get(kind, _pillow_head)(data)
+    if kind == "HEIF":
+        return _heif_size(data)
+    head = _pillow_head(data)
     return None if head is None else head.size
 
 
@@ -113,24 +115,6 @@ def significant_bits(data: bytes) -> int | None:
     return max(stated[:3] if len(stated) > 2 else stated[:1]) if stated else None
 
 
-def _jpeg_marks(data: bytes) -> Iterator[int]:
-    """Yield the markers of the segments and scans of a JPEG file up to its end-of-image marker."""
-    at = 2
-    while at + 2 <= len(data) and data[at] == 0xFF:
-        kind = data[at + 1]
-        if kind == 0xFF:  # fill byte
-            at += 1
-        elif kind in _JPEG_ALONE:
-            at += 2
-        else:
-            yield kind
-            at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
-            mark = _JPEG_SCAN_END.search(data, at) if kind == 0xDA else None
-            at = at if mark is None else mark.start()
-            if kind == 0xD9 or (kind == 0xDA and mark is None):
-                return
-
-
 def _png_damage(data: bytes) -> str | None:
     """Describe the damage in the chunks of a PNG file, such as a wrong checksum. Return None if they are complete."""
     if declared_size(data) is None and len(data) >= 24:
@@ -151,63 +135,31 @@ def _png_damage(data: bytes) -> str | None:
 def _jpeg_damage(data: bytes) -> str | None:
     """Describe the damage in the structure of a JPEG file. Return None if it is complete.
 
-    The file is damaged if it has no end-of-image marker, too many scans, or no size.
+    The file is damaged if it has no size, no end-of-image marker after its first scan, or too many scans.
     """
-    kinds = list(_jpeg_marks(data))
-    if 0xD9 not in kinds:
+    picture = _pillow_head(data)
+    start = 2 if picture is None else picture.fp.tell()
+    end = data.find(_END_OF_IMAGE, start)
+    scans = data.count(_START_OF_SCAN, start, end) + 1
+    if end < 0:
         return f"a JPEG file cut short (it ends after {len(data)} bytes)"
-    if kinds.count(0xDA) > _MOST_SCANS:
-        return f"a JPEG file of {kinds.count(0xDA)} scans"
-    return "a JPEG file without a size" if _pillow_head(data) is None else None
+    if scans > _MOST_SCANS:
+        return f"a JPEG file of {scans} scans"
+    return "a JPEG file without a size" if picture is None else None
 
 
-_PNM_HEAD = re.compile(
-    rb"P[56](?:\s+|#[^\n]*\n)+?(\d{1,9})(?:\s+|#[^\n]*\n)+?(\d{1,9})(?:\s+|#[^\n]*\n)+?(\d{1,5})\s"
-)
-_LARGEST_HEAD = 4096
-
-
-@dataclass(frozen=True)
-class PnmHead:
-    """Header of a PGM or PPM file.
-
-    Attributes:
-        size: width and height.
-        full: stored value of full scale.
-        end: offset in the file at which the samples end.
-    """
-
-    size: tuple[int, int]
-    full: int
-    end: int
-
-
-def pnm_head(data: bytes) -> PnmHead | None:
-    """Parse the header of a PGM or PPM file. Return None if it is invalid."""
-    match = _PNM_HEAD.match(data[:_LARGEST_HEAD])
-    if match is None:
-        return None
-    width, height, full = (int(text) for text in match.groups())
-    samples = width * height * (1 if data[:2] == b"P5" else 3)
-    end = match.end() + samples * (1 if full < 256 else 2)
-    return PnmHead((width, height), full, end) if 0 < full < 1 << 16 else None
-
-
-def pnm_damage(data: bytes) -> str | None:
-    """Describe the damage in the structure of a PGM or PPM file. Return None if it is complete."""
-    head = pnm_head(data)
-    if head is None:
-        return "a PGM or PPM file without a size and full scale"
-    return None if head.end <= len(data) else f"a PGM or PPM file cut short (it ends after {len(data)} bytes)"
-
-
-_PILLOW: dict[str, Any] = {"BMP": BmpImageFile, "JPEG": JpegImageFile, "WebP": WebPImageFile}
+_PILLOW: dict[str, Any] = {
+    "BMP": BmpImageFile,
+    "JPEG": JpegImageFile,
+    "PNM": PpmImageFile,
+    "WebP": WebPImageFile,
+}
 
 
 def opened_picture(data: bytes) -> Any:
-    """Open a BMP, JPEG or WebP file with Pillow without decoding its pixels.
+    """Open a BMP, JPEG, PGM, PPM or WebP file with Pillow without decoding its pixels.
 
-    ``data`` may be the start of a BMP or JPEG file, but must be a whole WebP file.
+    ``data`` may be the start of a file, except for a WebP file, which must be whole.
 
     Raises:
         Exception: the file is damaged. Pillow raises several kinds of errors.
@@ -220,6 +172,26 @@ def _pillow_head(data: bytes) -> Any:
     with contextlib.suppress(Exception):
         return opened_picture(data)
     return None
+
+
+def pnm_full_scale(data: bytes) -> int | None:
+    """Return the stored value of full scale in the header of a PGM or PPM file. Return None for any other file."""
+    picture = _pillow_head(data) if picture_kind(data) == "PNM" else None
+    if picture is None:
+        return None
+    decoder, _, _, mode = picture.tile[0]
+    return int(mode[1]) if decoder == "ppm" else {"I;16B": 65535}.get(mode, 255)
+
+
+def pnm_damage(data: bytes) -> str | None:
+    """Describe the damage in the structure of a PGM or PPM file. Return None if it is complete."""
+    picture = _pillow_head(data)
+    full = pnm_full_scale(data)
+    if picture is None or full is None:
+        return "a PGM or PPM file without a size and full scale"
+    samples = math.prod(picture.size) * len(picture.getbands())
+    end = picture.tile[0][2] + samples * (1 if full < 256 else 2)
+    return None if end <= len(data) else f"a PGM or PPM file cut short (it ends after {len(data)} bytes)"
 
 
 def pillow_damage(data: bytes) -> str | None:
@@ -248,117 +220,75 @@ def pillow_damage(data: bytes) -> str | None:
 
 
 _AVIF = (b"avif", b"avis")
+_TURN = re.compile(rb"\0\0\0\x09irot(.)", re.DOTALL)
+"""Pattern that finds the rotation of a HEIC file for display, in quarter turns counter-clockwise (ISO/IEC 23008-12)."""
+_MIRROR = b"\0\0\0\x09imir"
 _ORIENTATION_OF_TURNS = (1, 8, 3, 6)
 """EXIF orientation for 0, 1, 2 and 3 quarter turns counter-clockwise."""
 HIGH_RANGE = {16: "PQ", 18: "HLG"}
 """Names of transfer characteristics (ITU-T H.273) that cannot be converted to linear light."""
 
 
-@dataclass(frozen=True)
-class HeifHead:
-    """Header of a HEIC file.
+def _opened_heif(data: bytes, where: str) -> Any:
+    """Open a HEIC file with pillow-heif without decoding its pixels.
 
-    Attributes:
-        size: stored width and height, before rotation for display.
-        turns: number of quarter turns counter-clockwise for display.
-        mirrored: True if the picture is mirrored for display.
+    Raises:
+        PolarguideError: pillow-heif is not installed. The message begins with ``where``.
+        Exception: the file is damaged. There are several kinds of errors.
     """
-
-    size: tuple[int, int]
-    turns: int
-    mirrored: bool
-
-    @property
-    def orientation(self) -> int:
-        """Rotation and mirroring for display as an EXIF orientation.
-
-        The orientation tag in the file is informative only (ISO/IEC 23008-12).
-        """
-        return _ORIENTATION_OF_TURNS[self.turns]
+    library = optional_import("pillow_heif", where)
+    return library.open_heif(io.BytesIO(data), convert_hdr_to_8bit=False, bgr_mode=True)
 
 
-def heif_head(data: bytes) -> HeifHead | None:
-    """Parse the header of a HEIC file. Return None if it states no size."""
-    try:
-        boxes = {kind: (start, end) for kind, start, end in _boxes(data, 0, len(data))}
-        start, end = boxes[b"meta"]
-        meta = {kind: span for kind, *span in _boxes(data, start + 4, end)}
-        wide = data[meta[b"pitm"][0]] > 0
-        (primary,) = struct.unpack_from(">I" if wide else ">H", data, meta[b"pitm"][0] + 4)
-        inside = {kind: span for kind, *span in _boxes(data, *meta[b"iprp"])}
-        properties = list(_boxes(data, *inside[b"ipco"]))
-        own = [properties[number - 1] for number in _properties(data, inside[b"ipma"][0], primary) if number]
-        at = {kind: start for kind, start, _ in own}
-        width, height = struct.unpack_from(">II", data, at[b"ispe"] + 4)
-        if b"clap" in at:  # encoders pad pictures to whole blocks
-            across, of_across, down, of_down = struct.unpack_from(">4I", data, at[b"clap"])
-            width = across // of_across
-            height = down // of_down
-        turns = data[at[b"irot"]] & 3 if b"irot" in at else 0
-    except (KeyError, IndexError, ZeroDivisionError, struct.error):
-        return None
-    return HeifHead((width, height), turns, b"imir" in at) if width and height else None
+def _heif_turns(data: bytes) -> int:
+    """Return the number of quarter turns counter-clockwise by which a HEIC file is rotated for display."""
+    return max((turn[0] & 3 for turn in _TURN.findall(data)), default=0)
 
 
-def _boxes(data: bytes, start: int, end: int) -> Iterator[tuple[bytes, int, int]]:
-    """Yield the kind of each box in a part of a HEIC file, and the start and end of the box's content.
+def heif_orientation(data: bytes) -> int:
+    """Return the EXIF orientation of a HEIC file. The orientation tag in the file is informative only."""
+    return _ORIENTATION_OF_TURNS[_heif_turns(data)]
 
-    The last box may end beyond the part.
+
+def _heif_size(data: bytes) -> tuple[int, int] | None:
+    """Return the stored width and height of a HEIC file, before rotation for display.
+
+    Return None if the file is damaged, or if pillow-heif is not installed.
     """
-    while start + 8 <= end:
-        length, kind = struct.unpack_from(">I4s", data, start)
-        head = 8
-        if length == 1:
-            (length,) = struct.unpack_from(">Q", data, start + 8)
-            head = 16
-        length = length or end - start
-        if length < head:
-            return
-        yield kind, start + head, start + length
-        start += length
-
-
-def _properties(data: bytes, start: int, item: int) -> list[int]:
-    """Return the numbers of the properties of an item. The first property has the number 1.
-
-    ``start`` is the offset of the box that associates items and properties.
-    """
-    version = data[start]
-    wide = data[start + 3] & 1
-    (count,) = struct.unpack_from(">I", data, start + 4)
-    start += 8
-    for _ in range(count):
-        (number,) = struct.unpack_from(">I" if version else ">H", data, start)
-        start += 4 if version else 2
-        length = data[start]
-        start += 1
-        if number == item:
-            values = struct.unpack_from(f">{length}{'H' if wide else 'B'}", data, start)
-            return [value & (0x7FFF if wide else 0x7F) for value in values]
-        start += length * (2 if wide else 1)
-    return []
+    with contextlib.suppress(Exception):
+        width, height = _opened_heif(data, "size").size
+        return (height, width) if _heif_turns(data) % 2 else (width, height)
+    return None
 
 
 def heif_damage(data: bytes) -> str | None:
-    """Describe the damage in the structure of a HEIC or AVIF file. Return None if it is complete."""
+    """Describe the damage or an unsupported feature of a HEIC or AVIF file. Return None if it can be decoded.
+
+    Without pillow-heif, damage is not found.
+    """
     if data[8:12] in _AVIF:
         return "an AVIF file"
-    if max((end for _, _, end in _boxes(data, 0, len(data))), default=0) > len(data):
-        return f"a HEIC file cut short (it ends after {len(data)} bytes)"
-    head = heif_head(data)
-    if head is None:
-        return "a HEIC file without a size"
-    return "a HEIC file that is mirrored for display" if head.mirrored else None
+    if _MIRROR in data:
+        return "a HEIC file that is mirrored for display"
+    if len(set(_TURN.findall(data))) > 1:
+        return "a HEIC file of pictures that are rotated differently"
+    try:
+        opened = _opened_heif(data, "damage")
+    except PolarguideError:  # reported when the pixels are read
+        return None
+    except Exception as error:
+        return f"a HEIC file that is damaged or cut short ({' '.join(str(error).split())[:200]})"
+    transfer, _ = heif_colors(data)
+    if transfer in HIGH_RANGE:
+        return f"a HEIC file of high dynamic range ({HIGH_RANGE[transfer]})"
+    return f"a HEIC file of {len(opened)} pictures" if len(opened) > 1 else None
 
 
 def heif_tags(data: bytes) -> bytes:
     """Return the EXIF block of a HEIC file. It is empty if there is no block, or if pillow-heif is not installed."""
-    try:
-        return bytes(
-            optional_import("pillow_heif", "EXIF").open_heif(io.BytesIO(data)).info.get("exif") or b""
-        )
-    except Exception:  # reported when the pixels are read
-        return b""
+    with contextlib.suppress(Exception):  # reported when the pixels are read
+        return bytes(_opened_heif(data, "EXIF").info.get("exif") or b"")
+    return b""
 
 
 def heif_colors(data: bytes) -> tuple[int | None, bytes | None]:
@@ -367,7 +297,7 @@ def heif_colors(data: bytes) -> tuple[int | None, bytes | None]:
     Raises:
         Exception: the file is damaged, or pillow-heif is not installed. There are several kinds of errors.
     """
-    info = optional_import("pillow_heif", "color").open_heif(io.BytesIO(data)).info
+    info = _opened_heif(data, "color").info
     return (info.get("nclx_profile") or {}).get("transfer_characteristics"), info.get("icc_profile")
 
 
@@ -384,27 +314,15 @@ def heif_pixels(path: Path, data: bytes) -> NDArray[Any]:
 
     Raises:
         PolarguideError: pillow-heif is not installed.
-        ValueError: the file is unsupported. The text of the error is a noun phrase with the reason.
         Exception: the file is damaged. There are several kinds of errors.
     """
-    library = optional_import("pillow_heif", str(path))
-    head = heif_head(data)
-    assert head is not None
-    opened = library.open_heif(io.BytesIO(data), convert_hdr_to_8bit=False, bgr_mode=True)
-    if len(opened) > 1:
-        raise ValueError(f"a HEIC file of {len(opened)} pictures")
-    transfer = (opened.info.get("nclx_profile") or {}).get("transfer_characteristics")
-    if transfer in HIGH_RANGE:
-        raise ValueError(f"a HEIC file of high dynamic range ({HIGH_RANGE[transfer]})")
-    bits = int(opened.info["bit_depth"])
-    pixels = np.asarray(opened)
-    pixels = np.rot90(pixels, -head.turns)
-    if pixels.shape[1::-1] != head.size:
-        raise ValueError("a HEIC file whose picture and header have different sizes")
+    opened = _opened_heif(data, str(path))
+    pixels = np.ascontiguousarray(np.rot90(np.asarray(opened), -_heif_turns(data)))
     if pixels.dtype == np.uint8:
-        return np.ascontiguousarray(pixels)
+        return pixels
+    bits = int(opened.info["bit_depth"])
     # The decoder shifts values to the top of 16 bits.
-    return rescaled(np.ascontiguousarray(pixels >> (16 - bits)), (1 << bits) - 1)
+    return rescaled(pixels >> (16 - bits), (1 << bits) - 1)
 
 
 def rescaled(pixels: NDArray[Any], full: int) -> NDArray[Any]:

@@ -30,7 +30,7 @@ from polarguide.capture.formats.headers import (
     find_damage,
     heif_pixels,
     picture_kind,
-    pnm_head,
+    pnm_full_scale,
     rescaled,
     significant_bits,
     tiff_full_scale,
@@ -556,9 +556,8 @@ def decode_stored(path: Path, data: bytes) -> NDArray[Any]:
             remedy="Export one gray or RGB picture. If the file has four angles, save each in a file of its own, "
             f"such as {path.stem}_0.tif and {path.stem}_45.tif; or use the raw mosaic.",
         ) from None
-    except Exception as error:  # decoders raise many kinds of errors
-        if kind == "HEIF" and isinstance(error, ValueError):
-            raise _unreadable(path, str(error)) from None
+    except Exception:  # decoders raise many kinds of errors
+        pixels = None
     if pixels is None:
         _require_memory(path, size)
         raise _unreadable(path, "one that cannot be decoded")
@@ -616,10 +615,9 @@ def stated_full_scale(path: Path, file: BinaryIO, samples: NDArray[Any]) -> int 
     kind = picture_kind(head)
     if kind == "PNG":
         return _full_of_significant(colors, significant_bits(head))
-    full = None
-    plain = pnm_head(head)
-    if plain is not None:
-        full = plain.full if plain.full < np.iinfo(samples.dtype).max else None
+    full = pnm_full_scale(head)
+    if full == np.iinfo(samples.dtype).max:
+        full = None
     elif kind in TIFFS:
         file.seek(0)
         with tifffile.TiffFile(file) as tiff:
@@ -706,7 +704,7 @@ def stated_size(path: Path) -> tuple[int, int] | None:
         file.seek(0)
         if kind in TIFFS:
             return tiff_size(file)
-        head = file.read(LARGEST_FILE if kind == "WebP" else HEAD)
+        head = file.read(LARGEST_FILE if kind in ("WebP", "HEIF") else HEAD)
         return {".hdr": hdr_size, ".npy": _array_size}.get(suffix, declared_size)(head)
     return None
 

@@ -20,11 +20,10 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
-from polarguide.capture.sensor.pattern import SENSORS, Pattern, sensor_pattern
+from polarguide.capture.sensor.pattern import Pattern, sensor_pattern
 from polarguide.core.errors import PolarguideError, require
 from polarguide.core.files import in_utf8, require_file, write_whole
 from polarguide.core.records import decode
-from polarguide.geometry.polarizer import ANGLES
 
 Array = NDArray[np.float32]
 
@@ -192,10 +191,8 @@ class AnalyzerCalibration:
         """Return the entry of ``scene.json`` that identifies the calibration."""
         return {"sensor": self.sensor, "lens": self.lens, "sha256": self.sha256}
 
-    def apply(
-        self, values: Array, *, offset: tuple[int, int] | None = None, scale: int | None = None
-    ) -> Array:
-        """Compute the intensities that ideal polarizers would measure.
+    def apply(self, mosaic: Array, *, offset: tuple[int, int] | None = None) -> Array:
+        """Compute the mosaic that ideal polarizers would measure.
 
         The Stokes vector of a cell is ``pinv(A) I``, with the four samples I and their analyzer vectors A [4, 3]. The
         result has the intensities of this Stokes vector behind ideal polarizers. The component of I that no Stokes
@@ -203,28 +200,39 @@ class AnalyzerCalibration:
         sensor therefore do not change, and noise remains measurable.
 
         Args:
-            values: linear values without black level, on any scale. Either a mosaic [H, W], or the intensities at 0,
-                45, 90 and 135 degrees, [4, h, w] or [4, h, w, C] with 1 or 3 channels. The sides of the intensities are
-                those of the mosaic, or half or a quarter of them.
+            mosaic: linear values without black level, on any scale, [H, W].
             offset: column and row of the sensor at which the mosaic starts. By default, it starts like the calibrated
                 region.
-            scale: number of sensor pixels per pixel of the intensities in each direction: 1, 2 or 4. By default, it
-                follows from the size.
 
         Returns:
-            float32 in the shape of ``values``. Rows and columns of incomplete cells do not change.
+            [H, W] float32. Rows and columns of incomplete cells do not change.
 
         Raises:
-            PolarguideError: the size of the values does not match the calibration.
-            ValueError: the shape is invalid.
+            PolarguideError: the mosaic is not inside the calibrated region.
         """
-        values = np.asarray(values, np.float32)
+        mosaic = np.asarray(mosaic, np.float32)
         start = self.offset if offset is None else offset
-        if values.ndim == 2:
-            return self._mosaic(values, start)
-        if values.ndim not in (3, 4) or values.shape[0] != 4 or values.shape[3:] not in ((), (1,), (3,)):
-            raise ValueError(f"expected [H, W], [4, H, W] or [4, H, W, C], found {list(values.shape)}")
-        return self._four(values, start, scale)
+        height, width = mosaic.shape
+        self.require_region(start, (width, height), "calibration")
+        left, top = self.pattern.shifted(*start).cell_corner()
+        height = (height - top) // 2 * 2
+        width = (width - left) // 2 * 2
+        matrices, rows, columns = self._coarse((start[0] + left, start[1] + top), (width, height))
+        inside = (slice(top, top + height), slice(left, left + width))
+        cells = mosaic[inside]
+        samples = [np.ascontiguousarray(cells[row::2, column::2]) for row, column in np.ndindex(2, 2)]
+        out = mosaic.copy()
+        part = np.empty_like(samples[0])
+        product = np.empty_like(samples[0])
+        for index, (row, column) in enumerate(np.ndindex(2, 2)):
+            part[:] = 0
+            for other, sample in enumerate(samples):
+                plane = matrices[index, other]
+                if plane.shape != sample.shape:  # cells share matrices
+                    plane = plane[:, columns][rows]
+                part += np.multiply(plane, sample, out=product)
+            out[inside][row::2, column::2] = part
+        return out
 
     def correction(self, offset: tuple[int, int], size: tuple[int, int]) -> Array:
         """Return the matrix that corrects the samples of each cell of a region.
@@ -244,110 +252,6 @@ class AnalyzerCalibration:
         """Return the largest intensity that the correction can give in a region if all samples are at most 1."""
         matrices, _, _ = self._coarse(offset, size)
         return float(np.maximum(matrices, 0).sum(axis=1).max())
-
-    def _mosaic(self, mosaic: Array, offset: tuple[int, int]) -> Array:
-        height, width = mosaic.shape
-        self.require_region(offset, (width, height), "calibration")
-        left, top = self.pattern.shifted(*offset).cell_corner()
-        height = (height - top) // 2 * 2
-        width = (width - left) // 2 * 2
-        matrices, rows, columns = self._coarse((offset[0] + left, offset[1] + top), (width, height))
-        inside = (slice(top, top + height), slice(left, left + width))
-        cells = mosaic[inside]
-        samples = [np.ascontiguousarray(cells[row::2, column::2]) for row, column in np.ndindex(2, 2)]
-        out = mosaic.copy()
-        part = np.empty_like(samples[0])
-        product = np.empty_like(samples[0])
-        for index, (row, column) in enumerate(np.ndindex(2, 2)):
-            part[:] = 0
-            for other, sample in enumerate(samples):
-                plane = matrices[index, other]
-                if plane.shape != sample.shape:  # cells share matrices
-                    plane = plane[:, columns][rows]
-                part += np.multiply(plane, sample, out=product)
-            out[inside][row::2, column::2] = part
-        return out
-
-    def _four(self, values: Array, offset: tuple[int, int], scale: int | None) -> Array:
-        matrices = self.of_pictures(values.shape[1:3], offset=offset, scale=scale)
-        if values.ndim == 4 and matrices.ndim == 4:
-            matrices = matrices[..., None]
-        elif values.shape[3:] != (3,) and matrices.ndim == 5:
-            matrices = matrices.mean(axis=-1, keepdims=values.ndim == 4)
-        out = np.empty_like(values)
-        product = np.empty_like(values[0])
-        for k in range(4):
-            np.multiply(matrices[k, 0], values[0], out=out[k])
-            for j in range(1, 4):
-                out[k] += np.multiply(matrices[k, j], values[j], out=product)
-        return out
-
-    def of_pictures(
-        self, shape: tuple[int, ...], *, offset: tuple[int, int] | None = None, scale: int | None = None
-    ) -> Array:
-        """Return the matrix that corrects each pixel of developed pictures.
-
-        Args:
-            shape: height and width of the pictures.
-            offset: see ``apply``.
-            scale: see ``apply``.
-
-        Returns:
-            The matrices, see ``correction_of_angles``.
-
-        Raises:
-            PolarguideError: the size of the pictures does not match the calibration.
-        """
-        offset = self.offset if offset is None else offset
-        left, top = self.pattern.shifted(*offset).cell_corner()
-        start = (offset[0] + left, offset[1] + top)
-        columns, rows = ((self.offset[axis] + self.size[axis] - start[axis]) // 2 * 2 for axis in (0, 1))
-        height, width = shape
-        fitting = [step for step in (1, 2, 4) if (rows // step, columns // step) == (height, width)]
-        require(
-            scale is not None or fitting,
-            "calibration",
-            expected=f"the calibration of a sensor with pictures of {width}x{height} pixels",
-            found=f"the calibration of {_region(self.offset, self.size)}",
-            remedy="Use the calibration of this camera, made with the region of these pictures.",
-        )
-        step = fitting[0] if scale is None else scale
-        self.require_region(start, (width * step, height * step), "calibration")
-        return self.correction_of_angles(start, (width * step, height * step), step)
-
-    def correction_of_angles(self, offset: tuple[int, int], size: tuple[int, int], scale: int) -> Array:
-        """Return the matrix that corrects the intensities at 0, 45, 90 and 135 degrees at each pixel of pictures.
-
-        Args:
-            offset: column and row of the sensor at which the pictures start. A cell must start there.
-            size: width and height of the pictures in pixels of the sensor.
-            scale: number of sensor pixels per pixel of the pictures in each direction: 1, 2 or 4.
-
-        Returns:
-            [4, 4, h, w], or [4, 4, h, w, 3] for a color sensor, whose colors have different analyzers.
-        """
-        pattern = self.pattern.shifted(*offset)
-        height = size[1] // scale
-        width = size[0] // scale
-        cells = self.correction(offset, (-(-size[0] // 4) * 4, -(-size[1] // 4) * 4))
-        places = [int(angle) for angle in pattern.angles[:2, :2].ravel()]
-        order = [places.index(angle) for angle in ANGLES]
-        cells = cells[order][:, order]
-        if pattern.colors is None:
-            planes = [_repeated(cells, 2 // scale)]
-            if scale == 4:
-                planes = [
-                    np.mean([cells[..., r::2, c::2] for r, c in np.ndindex(2, 2)], axis=0, dtype=np.float32)
-                ]
-        else:
-            corners = [(row, column) for row, column in np.ndindex(2, 2)]
-            planes = []
-            for color in range(3):
-                own = [c for c in corners if int(pattern.colors[2 * c[0], 2 * c[1]]) == color]
-                mean = np.stack([cells[..., row::2, column::2] for row, column in own]).mean(axis=0)
-                planes.append(_repeated(mean, 4 // scale))
-        stacked = np.stack(planes, axis=-1)[:, :, :height, :width]
-        return stacked[..., 0] if pattern.colors is None else stacked
 
     def _coarse(
         self, offset: tuple[int, int], size: tuple[int, int]
@@ -420,14 +324,9 @@ def _region(offset: tuple[int, int], size: tuple[int, int]) -> str:
     return f"{size[0]}x{size[1]} pixels{place}"
 
 
-def _repeated(planes: Array, times: int) -> Array:
-    return np.repeat(np.repeat(planes, times, axis=-2), times, axis=-1) if times > 1 else planes
-
-
 FORMAT = "polarguide-analyzers"
 VERSION = 1
 SUFFIX = ".safetensors"
-MOST_THROUGHPUT = 1e3
 _LONGEST_HEADER = 100_000_000  # limit of safetensors in bytes; text gives a larger number
 _ENTRY = "polarguide"
 _TENSOR = "vectors"
@@ -511,11 +410,8 @@ def read_analyzers(path: Path) -> AnalyzerCalibration:
     if _ENTRY not in entries or vectors is None:
         raise _damaged(path, "another safetensors file")
     metadata = decode(entries[_ENTRY].encode(), _Metadata, path, remedy=_REMEDY)
-    _require(
-        metadata.format == FORMAT and metadata.version == VERSION,
-        path,
-        f"{metadata.format}, version {metadata.version}",
-    )
+    if (metadata.format, metadata.version) != (FORMAT, VERSION):
+        raise _damaged(path, f"{metadata.format}, version {metadata.version}")
     require(
         _checksum(metadata, vectors) == metadata.sha256,
         path,
@@ -523,62 +419,10 @@ def read_analyzers(path: Path) -> AnalyzerCalibration:
         found="other content: the file is damaged or was changed",
         remedy=_REMEDY,
     )
-    calibration = AnalyzerCalibration(
+    return AnalyzerCalibration(
         metadata.sensor, metadata.lens, (metadata.offset_x, metadata.offset_y), (metadata.width, metadata.height),
         metadata.block, vectors, metadata.reference, metadata.polarizer_extinction, metadata.sha256,
     )  # fmt: skip
-    _require_sound(path, calibration)
-    return calibration
-
-
-def _require_sound(path: Path, calibration: AnalyzerCalibration) -> None:
-    """Refuse a calibration whose checksum is valid but whose content is not.
-
-    Raises:
-        PolarguideError: the sensor is unknown, the shape of the vectors is wrong, or a vector is not that of a
-            polarizer.
-    """
-    _require(calibration.sensor in SENSORS, path, f"the unknown sensor {calibration.sensor!r}")
-    period = calibration.pattern.period
-    shape = (*grid_shape(calibration.offset, calibration.size, calibration.block), period, period, 3)
-    _require(
-        calibration.block % period == 0
-        and calibration.vectors.shape == shape
-        and calibration.vectors.dtype == np.float32,
-        path,
-        f"vectors {list(calibration.vectors.shape)} of {calibration.vectors.dtype} instead of {list(shape)}",
-    )
-    gain = calibration.vectors[..., 0]
-    _require(
-        np.isfinite(calibration.vectors).all() and (gain > 0).all(),
-        path,
-        "vectors that are not finite or have no throughput",
-    )
-    _require(
-        gain.min() >= 1 / MOST_THROUGHPUT and gain.max() <= MOST_THROUGHPUT,
-        path,
-        f"throughputs of {gain.min():g} to {gain.max():g} instead of a mean of 1/2",
-    )
-    _require(
-        (
-            np.hypot(calibration.vectors[..., 1], calibration.vectors[..., 2]) >= LEAST_DIATTENUATION * gain
-        ).all(),
-        path,
-        "vectors of pixels that hardly polarize",
-    )
-    nominal = 2 * np.radians(calibration.pattern.angles)
-    angles = np.arctan2(calibration.vectors[..., 2], calibration.vectors[..., 1])
-    # Equal angles would not determine the light.
-    _require(
-        (np.cos(angles - nominal) >= np.cos(2 * FARTHEST_ANGLE)).all(),
-        path,
-        "vectors of polarizers far from the sensor's angles",
-    )
-
-
-def _require(condition: object, path: Path, found: str) -> None:
-    if not condition:
-        raise _damaged(path, found)
 
 
 def _damaged(path: Path, found: str) -> PolarguideError:

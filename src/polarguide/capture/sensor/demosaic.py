@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,16 +16,8 @@ from polarguide.capture.view import ANGLES
 Array = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
-GUIDED_RADIUS = 3
-"""Largest distance in pixels between a sample and a pixel that depends on it in guided interpolation.
-
-The guide is computed from samples at a distance of up to 2 pixels, and is used at a distance of 1 pixel.
-"""
-
 _TENT = np.outer([1, 2, 1], [1, 2, 1]).astype(np.float32)
 _HALVES = np.array([0.5, 1, 0.5], np.float32)
-_SOFT = np.float32(1e-2)
-_SOFT_SQUARE = np.float32(1e-4)
 
 
 def interpolate_bilinear(values: Array, known: Mask) -> Array:
@@ -57,69 +49,6 @@ def bilinear_cells(mosaic: Array, row: int, column: int, out: Array) -> None:
     cv2.sepFilter2D(spread, -1, _HALVES, _HALVES, dst=out, borderType=cv2.BORDER_REFLECT_101)
 
 
-def guided_color(bayer: Array, colors: NDArray[np.int64]) -> Array:
-    """Interpolate the missing colors of a Bayer picture. Directions with strong gradients get small weights.
-
-    Args:
-        bayer: values [H, W].
-        colors: color of each pixel, 0, 1 or 2 for R, G or B.
-
-    Returns:
-        [H, W, 3].
-    """
-    at = _neighbors(bayer)
-    center = 2 * bayer
-    bend_x = center - at(0, -2) - at(0, 2)
-    bend_y = center - at(-2, 0) - at(2, 0)
-    weight_x = 1 / ((np.abs(at(0, -1) - at(0, 1)) + np.abs(bend_x)) ** 2 + _SOFT_SQUARE)
-    weight_y = 1 / ((np.abs(at(-1, 0) - at(1, 0)) + np.abs(bend_y)) ** 2 + _SOFT_SQUARE)
-    along_x = (at(0, -1) + at(0, 1)) / 2 + bend_x / 8
-    along_y = (at(-1, 0) + at(1, 0)) / 2 + bend_y / 8
-    green = np.where(colors == 1, bayer, (along_x * weight_x + along_y * weight_y) / (weight_x + weight_y))
-    red, blue = (green + interpolate_bilinear(bayer - green, colors == color) for color in (0, 2))
-    return np.stack([red, green, blue], axis=-1).astype(np.float32)
-
-
-def _half_s0(mosaic: Array) -> Array:
-    """Estimate ``S0 / 2`` at each pixel of a mosaic.
-
-    A pixel belongs to four windows of 2 x 2 pixels. The mean of each window is an estimate, because a window has all
-    four angles. The result is the weighted mean of the four estimates. A window has a small weight if the picture
-    changes strongly from the pixel toward this window.
-    """
-    at = _neighbors(mosaic)
-    total = np.zeros_like(mosaic)
-    weights = np.zeros_like(mosaic)
-    for down in (-1, 1):
-        for right in (-1, 1):
-            window = (mosaic + at(down, 0) + at(0, right) + at(down, right)) / 4
-            # Only samples of one angle are compared. Other differences are polarization, not edges.
-            outward = ((2 * down, 0), (0, 2 * right), (2 * down, 2 * right))
-            across = ((down, 0), (0, right), (down, right))
-            gradient = sum(np.abs(at(y, x) - mosaic) for y, x in outward)
-            gradient += sum(np.abs(at(y, x) - at(-y, -x)) for y, x in across) / 2
-            weight = 1 / (gradient + _SOFT)
-            total += weight * window
-            weights += weight
-    return total / weights
-
-
-def _neighbors(values: Array) -> Callable[[int, int], Array]:
-    """Return a function that shifts a picture.
-
-    The function has the arguments y and x. At each pixel, its result is the value y pixels below and x pixels to the
-    right.
-    """
-    height, width = values.shape
-    # Reflection about the outermost pixel continues the pattern.
-    padded = cv2.copyMakeBorder(values, 2, 2, 2, 2, cv2.BORDER_REFLECT_101)
-
-    def at(y: int, x: int) -> Array:
-        return np.asarray(padded[2 + y : 2 + y + height, 2 + x : 2 + x + width])
-
-    return at
-
-
 def _filtered(values: Array) -> Array:
     return np.asarray(cv2.filter2D(values, -1, _TENT, borderType=cv2.BORDER_CONSTANT))
 
@@ -147,7 +76,6 @@ def demosaic(
     pattern: Pattern,
     *,
     mode: str,
-    interpolation: str,
     registered: bool = True,
     colored: bool = True,
 ) -> DemosaicedPicture:
@@ -161,41 +89,40 @@ def demosaic(
       between neighboring pixels.
 
     The four samples of a cell are half a cell apart. If ``registered`` is True, the mode ``half`` interpolates all four
-    angles at the center of the cell: it averages the Stokes components of the mode ``full`` over the cell. With
-    bilinear interpolation, S0 is taken from the samples of the cell instead, because the average would blur it.
+    angles at the center of the cell: it averages S1 and S2 of the mode ``full`` over the cell. S0 is taken from the
+    samples of the cell, because the average would blur it.
 
     Args:
         values: linear intensities [H, W] after black level and gains.
         bad: mask of unusable samples, [H, W].
         pattern: pattern of the top-left pixel, which starts a whole polarizer cell.
         mode: a key of ``DEMOSAIC_MODES``.
-        interpolation: method of interpolation, ``bilinear`` or ``guided``.
         registered: if True, the mode ``half`` interpolates all four angles at the center of each cell.
         colored: if True, the result of a monochrome sensor has three equal channels. If False, it has one channel.
 
     Returns:
         The picture, of size ``H // s`` x ``W // s``, where s is 2, 4 or 1. Incomplete cells are left out.
     """
-    invalid = spoiled(bad, pattern, mode=mode, interpolation=interpolation, registered=registered)
+    invalid = spoiled(bad, pattern, mode=mode, registered=registered)
     step = 4 if mode == "quarter" else 2
     values = values[: values.shape[0] // step * step, : values.shape[1] // step * step]
     if mode == "quarter":
         picture = _superpixels(values, pattern)
     else:
-        cells = _cells(values, pattern, interpolation)
+        cells = _cells(values, pattern)
         if mode == "full":
-            picture = _full(cells, pattern, interpolation)
+            picture = _full(cells, pattern)
         else:
             places = {int(pattern.angles[place]): place for place in cells}
             picture = np.stack([cells[places[angle]] for angle in ANGLES])
             if registered:
-                picture = _registered(picture, _full(cells, pattern, interpolation), interpolation)
+                picture = _registered(picture, _full(cells, pattern))
     if colored and picture.shape[-1] == 1:
         picture = np.repeat(picture, 3, axis=-1)
     return DemosaicedPicture(picture, invalid)
 
 
-def spoiled(bad: Mask, pattern: Pattern, *, mode: str, interpolation: str, registered: bool = True) -> Mask:
+def spoiled(bad: Mask, pattern: Pattern, *, mode: str, registered: bool = True) -> Mask:
     """Return a mask of the pixels that ``demosaic`` computes from an unusable sample.
 
     ``demosaic`` describes the arguments.
@@ -208,21 +135,19 @@ def spoiled(bad: Mask, pattern: Pattern, *, mode: str, interpolation: str, regis
     if mode != "quarter":
         colored = np.empty_like(bad)
         for row, column in np.ndindex(2, 2):
-            colored[row::2, column::2] = _spoiled_colors(bad, pattern, (row, column), interpolation)
+            colored[row::2, column::2] = _spoiled_colors(bad, pattern, (row, column))
         # The 3x3 pixels around a pixel have all angles that it uses.
-        full = _dilated(colored, 1 if interpolation == "bilinear" else GUIDED_RADIUS)
+        full = _dilated(colored, 1)
         bad = full if mode == "full" else colored | full if registered else colored
     return np.asarray(bad.reshape(bad.shape[0] // step, step, bad.shape[1] // step, step).any(axis=(1, 3)))
 
 
-def _spoiled_colors(bad: Mask, pattern: Pattern, place: tuple[int, int], interpolation: str) -> Mask:
+def _spoiled_colors(bad: Mask, pattern: Pattern, place: tuple[int, int]) -> Mask:
     """Return a mask of the colors that are computed from an unusable sample, for one angle of each cell."""
     row, column = place
     mask = bad[place[0] :: 2, place[1] :: 2]
     if pattern.colors is None:
         return mask
-    if interpolation != "bilinear":
-        return _dilated(mask, GUIDED_RADIUS)
     bayer = tiled(pattern.colors[row::2, column::2], mask.shape)
     used = mask.copy()
     for color in range(3):
@@ -235,7 +160,7 @@ _Cells = dict[tuple[int, int], Array]
 """Picture [H/2, W/2, C] of the samples at each position (row, column) in the polarizer cells."""
 
 
-def _cells(values: Array, pattern: Pattern, interpolation: str) -> _Cells:
+def _cells(values: Array, pattern: Pattern) -> _Cells:
     colors: _Cells = {}
     for row, column in np.ndindex(2, 2):
         sample = values[row::2, column::2]
@@ -243,16 +168,13 @@ def _cells(values: Array, pattern: Pattern, interpolation: str) -> _Cells:
             colors[row, column] = sample[..., None]
             continue
         bayer = tiled(pattern.colors[row::2, column::2], sample.shape)
-        if interpolation == "bilinear":
-            colors[row, column] = np.stack(
-                [interpolate_bilinear(sample, bayer == color) for color in range(3)], axis=-1
-            )
-        else:
-            colors[row, column] = guided_color(sample, bayer)
+        colors[row, column] = np.stack(
+            [interpolate_bilinear(sample, bayer == color) for color in range(3)], axis=-1
+        )
     return colors
 
 
-def _full(cells: _Cells, pattern: Pattern, interpolation: str) -> Array:
+def _full(cells: _Cells, pattern: Pattern) -> Array:
     """Interpolate the missing angles at full size. Each color channel is treated like a monochrome mosaic."""
     height, width, channels = cells[0, 0].shape
     mosaic = np.empty((channels, 2 * height, 2 * width), np.float32)
@@ -262,18 +184,12 @@ def _full(cells: _Cells, pattern: Pattern, interpolation: str) -> Array:
     # Planes by angle and channel; channels move to the end as a view.
     planes = np.empty((len(ANGLES), channels, 2 * height, 2 * width), np.float32)
     for channel, plane in enumerate(mosaic):
-        if interpolation == "bilinear":
-            for index, angle in enumerate(ANGLES):
-                bilinear_cells(plane, *at[angle], out=planes[index, channel])
-        else:
-            guide = _half_s0(plane)
-            places = tiled(pattern.angles[:2, :2], plane.shape)
-            for index, angle in enumerate(ANGLES):
-                planes[index, channel] = guide + interpolate_bilinear(plane - guide, places == angle)
+        for index, angle in enumerate(ANGLES):
+            bilinear_cells(plane, *at[angle], out=planes[index, channel])
     return np.moveaxis(planes, 1, -1)
 
 
-def _registered(plain: Array, full: Array, interpolation: str) -> Array:
+def _registered(plain: Array, full: Array) -> Array:
     """Return the intensities of the four angles at the centers of the cells.
 
     The full-size intensities are averaged over each cell.
@@ -282,9 +198,7 @@ def _registered(plain: Array, full: Array, interpolation: str) -> Array:
     cells = full.reshape(angles, height, 2, width, 2, channels)
     upper, lower = (cells[:, :, row, :, 0] + cells[:, :, row, :, 1] for row in (0, 1))
     centered = np.asarray((upper + lower) / np.float32(4), np.float32)
-    if interpolation == "bilinear":
-        centered += (plain.sum(axis=0) - centered.sum(axis=0)) / np.float32(4)
-    return centered
+    return centered + (plain.sum(axis=0) - centered.sum(axis=0)) / np.float32(4)
 
 
 def _superpixels(values: Array, pattern: Pattern) -> Array:

@@ -21,16 +21,18 @@ from polarguide.core.errors import PolarguideError
 from polarguide.core.progress import SILENT, Reporter
 from polarguide.core.system import peak_memory_mib
 from polarguide.gaussians.initialize import camera_reach
-from polarguide.optics import Mount
-from polarguide.optics.color import shown
-from polarguide.results.evaluation.coverage import (
+from polarguide.geometry.coverage import (
+    HAZE_DEPTH,
+    ConfirmedSurfaces,
     Coverage,
     DepthMap,
     depth_map_of_rendering,
     depth_map_of_truth,
 )
+from polarguide.optics import Mount
+from polarguide.optics.color import shown
 from polarguide.results.evaluation.mesh import mesh_scores
-from polarguide.results.evaluation.metrics import HAZE_DEPTH, Selection, normal_angles_deg
+from polarguide.results.evaluation.metrics import Selection, normal_angles_deg
 from polarguide.results.evaluation.record import METRICS_FILE, code_digest, commit, write_metrics
 from polarguide.results.evaluation.scores import ErrorsByObject, ViewScores, score_view
 from polarguide.results.evaluation.table import registered_digests
@@ -311,13 +313,14 @@ def evaluate(
     fitted = [view.name for view in tests if not view.measures_radiance]
     if fitted:
         reporter.say(f"scored with an analyzer fitted on the other half of the picture: {listed(fitted)}")
-    coverage = _coverage(run, reporter)
+    coverage, surfaces = _coverage(run, reporter)
     views = {}
     by_object = ErrorsByObject(facts.objects)
     sheet = ErrorSheet(len(tests))
     with reporter.track("scoring", len(tests)) as advance:
         for view in tests:
-            views[view.name] = _score(run, view, facts, coverage.seen[view.name], by_object, sheet)
+            nearest = surfaces.nearest(view.camera)
+            views[view.name] = _score(run, view, facts, coverage.seen[view.name], nearest, by_object, sheet)
             advance(len(views))
     sheet.write(run.folder / ERRORS_FILE)
     memory = _peak_memory(peak_before)  # The mesh scores below are not part of rendering.
@@ -349,8 +352,8 @@ def evaluate(
     )
 
 
-def _coverage(run: OpenedRun, reporter: Reporter) -> Coverage:
-    """Find the pixels of the test views whose content is visible in a training view.
+def _coverage(run: OpenedRun, reporter: Reporter) -> tuple[Coverage, ConfirmedSurfaces]:
+    """Find the pixels of the test views that a training view shows, and the surfaces that two training views confirm.
 
     The depth of a test view comes from the ground truth if it has one. All other depths are rendered.
     """
@@ -373,11 +376,14 @@ def _coverage(run: OpenedRun, reporter: Reporter) -> Coverage:
         known = None if truth is None else truth.depth
         held_out[view.name] = surface(view) if known is None else depth_map_of_truth(view.camera, known)
     coverage = Coverage(held_out)
+    grids = []
     with reporter.track("finding the photographed pixels", len(training)) as advance:
         for count, view in enumerate(training, start=1):
-            coverage.add(surface(view))
+            depths = surface(view)
+            coverage.add(depths)
+            grids.append(depths.on_grid())
             advance(count)
-    return coverage
+    return coverage, ConfirmedSurfaces(grids)
 
 
 def _score(
@@ -385,15 +391,17 @@ def _score(
     view: View,
     facts: SceneFacts,
     seen: Tensor,
+    nearest: Tensor,
     by_object: ErrorsByObject,
     sheet: ErrorSheet,
 ) -> ViewScores:
     # The target is created first, because a later copy to the device would wait for the rendering.
-    target = ViewTarget.of_view(view, facts, run.model.device).with_coverage(seen)
+    target = ViewTarget.of_view(view, facts, run.model.device).with_coverage(seen, nearest > 0)
     result = run.model.render(view.camera, depth=True, surface=True)
     stokes = run.model.stokes(result, view.camera)
     if not view.measures_radiance:
         result = result.with_layers(final=cross_fitted(view, result.final, stokes))
+    in_free_space = run.model.alpha_in_front(view.camera, HAZE_DEPTH * nearest)
     in_front = None
     if target.depth is not None:
         in_front = run.model.alpha_in_front(view.camera, HAZE_DEPTH * target.depth)
@@ -401,7 +409,9 @@ def _score(
     if undecided is not None:
         result = result.with_layers(undecided=undecided)
     sheet.add(view, target, result, stokes)
-    return score_view(target, result, stokes=stokes, in_front=in_front, by_object=by_object)
+    return score_view(
+        target, result, stokes=stokes, in_front=in_front, in_free_space=in_free_space, by_object=by_object
+    )
 
 
 def _peak_memory(before: float | None) -> dict[str, Any]:

@@ -25,7 +25,7 @@ Layers = Mapping[str, Tensor | None]
 """Rendered layers of a view by name; None for a missing layer.
 
 The names are ``final``, ``normal``, ``specular``, ``diffuse``, ``depth``, ``alpha``, ``polarization`` (predicted) and
-``in_front`` (the alpha in front of the surface).
+``in_front`` and ``in_free_space`` (the alpha in front of the true surface, and of a confirmed surface).
 """
 Measure = Callable[[ViewTarget, Layers], Tensor | None]
 """Function that computes a metric of a view as a tensor [], or returns None if the metric is undefined.

@@ -237,8 +237,6 @@ def _blur(channels: Tensor) -> Tensor:
 
 LEAST_POLARIZED = 1e-3
 """Ratio of |S1| + |S2| to S0 below which the Stokes error would compare noise."""
-HAZE_DEPTH = 0.8
-"""Depth in front of a surface that counts as haze, relative to the depth of the surface."""
 DEPTH_BEYOND = 1.25
 """Depth behind a surface that counts as an error, relative to the depth of the surface."""
 

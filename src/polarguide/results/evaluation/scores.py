@@ -165,6 +165,7 @@ def score_view(
     *,
     stokes: Tensor | None = None,
     in_front: Tensor | None = None,
+    in_free_space: Tensor | None = None,
     by_object: ErrorsByObject | None = None,
 ) -> ViewScores:
     """Score one rendered view on the device of its rendering.
@@ -176,8 +177,8 @@ def score_view(
         target: the ground truth of the view, on the same device.
         rendered: the rendering. Missing layers are not scored.
         stokes: [3, H, W, 3] predicted Stokes vectors on the scale of a picture S0/2, or None without a prediction.
-        in_front: [H, W] share of the alpha that lies in front of ``HAZE_DEPTH`` times the true depth. None skips the
-            metric of haze.
+        in_front: [H, W] alpha in front of ``HAZE_DEPTH`` times the true depth. None skips its metric of haze.
+        in_free_space: [H, W] the same for the depth of surfaces that training views confirm.
         by_object: receives the errors of the view.
 
     Returns:
@@ -190,6 +191,7 @@ def score_view(
     layers = {name: _detached(rendered.layers.get(name)) for name in names}
     layers["polarization"] = None if stokes is None else _detached(stokes[1:].movedim(0, 2).flatten(2))
     layers["in_front"] = _detached(in_front)
+    layers["in_free_space"] = _detached(in_free_space)
     broken = torch.zeros_like(target.valid.mask)
     for name, layer in layers.items():
         if layer is not None:

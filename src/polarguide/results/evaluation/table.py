@@ -31,6 +31,8 @@ from polarguide.results.evaluation.target import ViewTarget
 HIGHEST_PSNR = 100.0
 """Upper bound of a recorded PSNR. Equal pictures have an infinite PSNR, which JSON cannot represent."""
 MESH_LABEL = "mesh F-score 1 %"
+WORST_VIEWS = ("psnr", "haze_free")
+"""Keys of the metrics whose worst view is listed beside the mean."""
 
 
 def _comparison(compare: Callable[..., Tensor], layer: str, *known: str) -> Measure:
@@ -189,8 +191,17 @@ BUILT_IN_METRICS: tuple[Metric, ...] = (
         measure=_comparison(depth_error_percent, "depth", "depth", "near", "extent"),
     ),
     Metric(
-        "haze_alpha",
+        "haze_free",
         "haze",
+        "%",
+        2,
+        "lower",
+        measure=_comparison(mean_alpha, "in_free_space", "confirmed"),
+        factor=100.0,
+    ),
+    Metric(
+        "haze_true",
+        "haze by true depth",
         "%",
         2,
         "lower",
@@ -294,8 +305,8 @@ def shown_metrics(record: Mapping[str, Any], *, scores_only: bool = False) -> li
     """Return the labels and values of the metrics of a run in the order of the table.
 
     A metric without a value is shown as "n/a" with a short reason; ``explained`` returns the long reasons. A metric
-    without a value and without a reason is left out, see ``absent_metrics``. The PSNR of the worst view is listed after
-    the mean PSNR.
+    without a value and without a reason is left out, see ``absent_metrics``. The worst view follows the mean of the
+    metrics in ``WORST_VIEWS``.
 
     Args:
         record: record of a run from ``metrics.json``.
@@ -313,7 +324,7 @@ def shown_metrics(record: Mapping[str, Any], *, scores_only: bool = False) -> li
         if value is not None or reason:
             why = str(reason).partition(": ")[0]
             lines.append((metric.label, f"n/a ({why})" if value is None else metric.text(value)))
-        if metric.key == "psnr":
+        if metric.key in WORST_VIEWS:
             lines += _worst_view(record, metric)
     return lines
 
@@ -329,11 +340,12 @@ def explained(record: Mapping[str, Any]) -> list[str]:
 
 
 def _worst_view(record: Mapping[str, Any], metric: Metric) -> list[tuple[str, str]]:
-    """Return the lowest value of a metric and its view as a line of the table; empty for fewer than two views."""
+    """Return the worst value of a metric and its view as a line of the table; empty for fewer than two views."""
     scored = {name: s[metric.key] for name, s in record.get("views", {}).items() if s[metric.key] is not None}
     if len(scored) < 2:
         return []
-    name = min(scored, key=lambda view: scored[view])
+    worst = min if metric.better == "higher" else max
+    name = worst(scored, key=lambda view: scored[view])
     return [(f"{metric.label}, worst view", f"{metric.text(scored[name])} ({name})")]
 
 

@@ -189,6 +189,7 @@ class ViewTarget:
         seen: valid pixels whose content is visible in a training view, or None if this was not determined.
         seen_windows: pixels of ``seen`` that are centers of SSIM windows.
         seen_polarized: pixels of ``seen`` that are also in ``polarized``.
+        confirmed: valid pixels with a surface that two training views confirm, or None if this was not determined.
         extent: extent of the scene in world units.
     """
 
@@ -213,6 +214,7 @@ class ViewTarget:
     seen: Selection | None = None
     seen_windows: Selection | None = None
     seen_polarized: Selection | None = None
+    confirmed: Selection | None = None
     extent: float = 1.0
 
     @classmethod
@@ -298,8 +300,13 @@ class ViewTarget:
         """Mask [H, W] of valid pixels that are visible in no training view; all False if this was not determined."""
         return self.valid.mask & ~(self.valid if self.seen is None else self.seen).mask
 
-    def with_coverage(self, seen: Tensor) -> ViewTarget:
-        """Return the target with a mask [H, W] on the CPU of pixels whose content is visible in a training view."""
+    def with_coverage(self, seen: Tensor, confirmed: Tensor | None = None) -> ViewTarget:
+        """Return the target with results of the training views.
+
+        Args:
+            seen: [H, W] bool on the CPU, pixels whose content is visible in a training view.
+            confirmed: [H, W] bool on the CPU, pixels with a surface that two training views confirm.
+        """
         device = self.photograph.device
         counted = seen & self.valid.mask.cpu()
         polarized = None if self.polarized is None else counted & self.polarized.mask.cpu()
@@ -308,6 +315,7 @@ class ViewTarget:
             seen=Selection.of(counted, device),
             seen_windows=Selection.of(window_centers(counted), device),
             seen_polarized=_selection(polarized, device),
+            confirmed=_selection(None if confirmed is None else confirmed & self.valid.mask.cpu(), device),
         )
 
 

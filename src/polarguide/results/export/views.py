@@ -22,8 +22,8 @@ from polarguide.core.files import holds_files, make_folder, require_inside
 from polarguide.core.options import NormalLayout, NormalOptions
 from polarguide.core.progress import Reporter
 from polarguide.geometry.camera import Camera
+from polarguide.geometry.coverage import OPAQUE
 from polarguide.geometry.vectors import dot
-from polarguide.results.evaluation.coverage import OPAQUE
 from polarguide.results.export.mesh import write_points
 from polarguide.results.export.placement import IMAGES, SUFFIX, Presented, write_colmap, write_transforms
 from polarguide.results.rendering.subject import Subject

@@ -1,16 +1,20 @@
-"""Coverage: the pixels of held-out views whose content a training view shows, on surfaces of known shape."""
+"""Coverage of held-out views and surfaces that training views confirm, on surfaces of known shape."""
 
 import pytest
 import torch
 from torch import Tensor
 
 from polarguide.geometry.camera import Camera, look_at
-from polarguide.results.evaluation.coverage import (
+from polarguide.geometry.coverage import (
+    HAZE_DEPTH,
+    ConfirmedSurfaces,
     Coverage,
     DepthMap,
     depth_map_of_rendering,
     depth_map_of_truth,
 )
+from polarguide.raster import Splats, rasterize_reference
+from polarguide.raster.surface import alpha_in_front
 
 SIZE = 48
 WALL = 4.0
@@ -105,3 +109,59 @@ def test_rendered_depths_are_background_beyond_the_cameras_or_without_alpha():
     surface = depth_map_of_rendering(MIDDLE, depth, alpha, middle, radius=4.0).depth.isfinite()
     assert not surface[:2].any()
     assert surface[2:].all()
+
+
+LEFT, RIGHT = (camera((x, 0.0, 0.0), (x, 0.0, WALL)) for x in (-1.0, 1.0))
+
+
+def test_two_views_confirm_a_wall():
+    nearest = ConfirmedSurfaces([wall(LEFT), wall(RIGHT)]).nearest(MIDDLE)
+    # The pictures of both views overlap in 28 columns of depth 4, in the middle of this view.
+    torch.testing.assert_close(nearest[:, 10:38], torch.full((SIZE, 28), WALL, dtype=torch.float64))
+    assert not nearest[:, :9].any()
+    assert not nearest[:, 39:].any()
+
+
+def test_one_view_confirms_nothing():
+    assert not ConfirmedSurfaces([wall(MIDDLE)]).nearest(LEFT).any()
+    assert not ConfirmedSurfaces([]).nearest(LEFT).any()
+    away = camera((0.0, 0.0, 0.0), (0.0, 0.0, -WALL))
+    assert not ConfirmedSurfaces([wall(LEFT), wall(RIGHT)]).nearest(away).any()
+
+
+def test_a_surface_that_another_view_sees_through_is_not_confirmed():
+    depth = plane_depth(MIDDLE, WALL)
+    depth[16:32, 16:32] = 2.0
+    surfaces = ConfirmedSurfaces([DepthMap(MIDDLE, depth), wall(LEFT), wall(RIGHT)])
+    assert float(surfaces.nearest(MIDDLE)[:, 10:38].min()) == pytest.approx(WALL)
+    both = ConfirmedSurfaces([DepthMap(MIDDLE, depth), DepthMap(MIDDLE, depth)])
+    assert float(both.nearest(MIDDLE)[24, 24]) == pytest.approx(2.0)
+
+
+def test_the_grid_of_a_large_picture_has_the_same_surfaces():
+    large = [view.scaled(10, 10 * SIZE, 10 * SIZE) for view in (LEFT, MIDDLE, RIGHT)]
+    assert wall(large[0]).on_grid().depth.shape == (160, 160)
+    nearest = ConfirmedSurfaces([wall(view) for view in large]).nearest(large[1])
+    assert nearest.shape == (10 * SIZE, 10 * SIZE)
+    assert nearest.min() == pytest.approx(WALL)
+    assert nearest.max() == pytest.approx(WALL)
+
+
+@pytest.mark.parametrize("layers", [0, 1, 4])
+def test_haze_is_the_alpha_of_fog_in_front_of_a_wall(layers):
+    """Each layer of fog is one wide Gaussian of alpha 0.06. A layer behind 0.8 of the depth belongs to the wall."""
+    depths = torch.tensor([*torch.linspace(1.0, 2.5, layers).tolist(), 0.9 * WALL])
+    count = len(depths)
+    fog = Splats(
+        torch.stack((torch.zeros(count), torch.zeros(count), depths), dim=1),
+        torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(count, 1),
+        torch.full((count, 3), 1e3),
+        torch.full((count,), 0.06),
+        torch.ones(count, 1),
+    )
+    surfaces = ConfirmedSurfaces([wall(view) for view in (LEFT, MIDDLE, RIGHT)])
+    by_views = surfaces.nearest(MIDDLE)
+    by_truth = plane_depth(MIDDLE, WALL)
+    for nearest in (by_views, by_truth):
+        alpha = alpha_in_front(fog, MIDDLE, HAZE_DEPTH * nearest, rasterize_reference)
+        assert float(alpha[nearest > 0].mean()) == pytest.approx(1 - 0.94**layers, abs=1e-4)
