@@ -311,6 +311,7 @@ class _Row(msgspec.Struct):
     alone: bool = True
     psnr: float | None = None
     held_out: float | None = None
+    gaussians: int | None = None
 
 
 _ROWS = msgspec.json.Decoder(_Row)
