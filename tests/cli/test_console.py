@@ -244,7 +244,7 @@ def test_help_of_every_verb_names_and_explains_every_flag(
     for parameter in inspect.signature(function).parameters.values():
         kind, fields, explained = kinds[parameter.name], [parameter.name], about
         if dataclasses.is_dataclass(kind):
-            fields = [field.name for field in dataclasses.fields(kind)]
+            fields = [field.name for field in dataclasses.fields(kind) if field.init]
             explained = "\n".join(base.__doc__ or "" for base in kind.__mro__)
             fields = [name for name in fields if (verb, name) not in ELSEWHERE]
         for name in fields:
