@@ -83,6 +83,7 @@ def test_values_of_another_version_of_a_recipe_are_named() -> None:
 def test_one_command_makes_each_table(tmp_path: Path) -> None:
     """From a comparison with recipes that both layouts have."""
     recipes = ["3dgs-dr", "polarguide-paper", "polarguide-paper:only-normals"]
+    (tmp_path / "runs").mkdir()
     write_tables(tmp_path / "runs", results([run("x", name, 0, psnr=30.0) for name in recipes]))
     for layout in LAYOUTS.values():
         out = tmp_path / layout.name

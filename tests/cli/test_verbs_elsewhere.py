@@ -145,7 +145,7 @@ def test_a_field_is_compared_with_gaussians(
 ) -> None:
     out = tmp_path / "out"
     command = ["compare", str(demo_scene), "--recipes", "3dgs", "gnerp", "--steps", "20", "gnerp=4"]
-    command += ["--downscale", "16", "--jobs", "1", "--out", str(out), "--report-views", "1"]
+    command += ["--downscale", "8", "--jobs", "1", "--out", str(out), "--report-views", "1"]
     assert run(command) == 0
     record = json.loads((out / "results.json").read_text())
     read_results(out / "results.json")
