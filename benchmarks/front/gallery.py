@@ -129,7 +129,7 @@ def sheet(runs: Path, scene: GalleryScene) -> Image.Image:
 
 
 def write_page(run: pg.Run, scene: GalleryScene) -> dict[str, float]:
-    """Write the page of a run and the picture that opens it, and return the scores in the gallery's table."""
+    """Set the credit of a run, write its page and the picture that opens it, and return its row of the record."""
     pg.present(
         run.folder,
         title=scene.title,

@@ -32,10 +32,10 @@ LINKED = {
 STYLE = re.compile(r"""(?:@import\s+(?:url\()?|url\()\s*["']?([^"')\s;]+)""", re.IGNORECASE)
 """Address in a style sheet."""
 REQUEST = re.compile(
-    r"""\b(?:fetch|import|importScripts|open|sendBeacon|Worker|WebSocket|EventSource)\s*\(\s*"""
+    r"""\b(?:(?:fetch|import|importScripts|open|sendBeacon|Worker|WebSocket|EventSource)\s*\(|from|import)\s*"""
     r"""(?:["'`]\w{0,7}["'`]\s*,\s*)?["'`]([^"'`]+)"""
 )
-"""Literal address in a request of a script. The second line skips the method of ``XMLHttpRequest.open``."""
+"""Literal address in a request or import of a script. The second line skips the method of ``XMLHttpRequest.open``."""
 
 
 class LoadedFiles(HTMLParser):
@@ -53,7 +53,8 @@ class LoadedFiles(HTMLParser):
         self.addresses += [values[name] for name in LOADED if name in values]
         self.addresses += re.split(r",\s+", values.get("srcset", ""))
         self.addresses += STYLE.findall(values.get("style", ""))
-        if tag == "link" and LINKED & {*values.get("rel", "").lower().split()}:
+        loads = tag == "link" and LINKED & {*values.get("rel", "").lower().split()}
+        if loads or tag in ("base", "image", "use"):
             self.addresses.append(values.get("href", ""))
 
     def handle_data(self, data: str) -> None:

@@ -1,12 +1,16 @@
-"""The site: its workflow, files of other hosts, and the gallery's table."""
+"""The site: its workflow, files of other hosts, and the gallery's table and sliders."""
 
+import io
 import json
 import sys
 from pathlib import Path
 
 import msgspec
+import numpy as np
 import pytest
 import yaml
+from browsers import chromium
+from PIL import Image
 
 ROOT = Path(__file__).resolve().parents[2]
 SCENES = ROOT / "docs" / "_static" / "scenes"
@@ -56,8 +60,11 @@ def test_committed_pages_styles_and_scripts_load_no_file_of_another_host():
         ("a.css", '@import "//cdn.test/a.css";'),
         ("a.css", "@font-face { src: url( 'https://cdn.test/a.woff2' ) }"),
         ("a.js", 'import("https://cdn.test/a.js")'),
+        ("a.js", 'import { a } from "https://cdn.test/a.js"'),
         ("a.js", "new WebSocket(`wss://cdn.test`)"),
         ("a.js", 'request.open("GET", "https://cdn.test/a")'),
+        ("a.html", '<base href="https://cdn.test/">'),
+        ("a.svg", '<use href="https://cdn.test/a.svg#a"/>'),
         ("a.svg", '<image xlink:href="https://cdn.test/a.png"/>'),
     ],
 )
@@ -112,3 +119,31 @@ def test_columns_and_rows_of_the_sheets_are_those_of_the_slider():
     assert len(columns) == 1 + len(gallery.RECIPES)
     assert len(layers) == len(gallery.ROWS)
     assert columns[1] == gallery.RECIPES[0]
+
+
+def test_a_slider_shows_the_chosen_pictures_of_a_sheet(tmp_path):
+    column, row = np.meshgrid(range(4), range(3))
+    colors = np.stack((60 * column, 80 * row, 0 * row), axis=-1).astype(np.uint8)
+    Image.fromarray(np.repeat(np.repeat(colors, 96, axis=0), 128, axis=1)).save(tmp_path / "sheet.png")
+    static = (ROOT / "docs" / "_static").as_uri()
+    (tmp_path / "page.html").write_text(
+        f'<!doctype html><link rel="stylesheet" href="{static}/polarguide.css">'
+        f'<script src="{static}/wipes.js" defer></script><img class="wipe" src="sheet.png" alt="a sheet">'
+    )
+
+    def sides():
+        shot = Image.open(io.BytesIO(page.locator(".pictures").screenshot())).convert("RGB")
+        return [
+            shot.getpixel((round(place * shot.width), shot.height // 2)) for place in (0.1, 0.4, 0.6, 0.9)
+        ]
+
+    with chromium() as browser:
+        page = browser.new_page()
+        page.goto((tmp_path / "page.html").as_uri())
+        assert sides() == [(0, 0, 0), (0, 0, 0), (180, 0, 0), (180, 0, 0)]
+        columns, layers = page.locator("select").all()
+        columns.select_option("ours without polarization")
+        layers.select_option("normals")
+        assert sides() == [(120, 160, 0), (120, 160, 0), (180, 160, 0), (180, 160, 0)]
+        page.get_by_role("slider").fill("75")
+        assert sides() == [(120, 160, 0)] * 3 + [(180, 160, 0)]
