@@ -187,7 +187,10 @@ def near_edges(truth: GroundTruth) -> Tensor:
 
 
 def scores(run: polarguide.Run, views: Sequence[View]) -> dict[str, tuple[float, float]]:
-    """Return the scores of foreground pixels near edges and elsewhere: layers and picture in dB, others as means."""
+    """Return the scores near edges and elsewhere: layers and picture in dB, others as means.
+
+    DoLP and AoLP include the background. All other scores are those of the foreground.
+    """
     errors: dict[str, tuple[list[Tensor], list[Tensor]]] = {}
     for view in views:
         truth = view.ground_truth
@@ -202,7 +205,7 @@ def scores(run: polarguide.Run, views: Sequence[View]) -> dict[str, tuple[float,
         predicted, true = optics.luminance(stokes), optics.luminance(view.stokes())
         degree = optics.dolp(true)
         turn = (torch.atan2(predicted[2], predicted[1]) - torch.atan2(true[2], true[1])) / 2
-        lit = truth.mask & (true[0] > 0.1) & ~view.invalid & ~view.saturated
+        lit = (true[0] > 0.1) & ~view.invalid & ~view.saturated
         found = {
             "specular dB": (result.layers["specular"], truth.specular / 2),
             "diffuse dB": (result.layers["diffuse"], truth.diffuse / 2),
