@@ -76,7 +76,11 @@ class Ours:
 
     def look(self) -> None:
         """Run forward and backward with all losses."""
-        self.trainer.backpropagate(self._next())
+        state = self.trainer.state
+        before = state.step
+        state.step += self._next()
+        self.trainer.backpropagate()
+        state.step = before
 
     def step(self) -> None:
         """Run a complete step."""

@@ -15,16 +15,14 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
-
-import msgspec
+from typing import TYPE_CHECKING, Any
 
 from polarguide.core.errors import PolarguideError, optional_import, require
 from polarguide.core.options import LOOPBACK
 from polarguide.core.progress import Advance, Reporter
 from polarguide.core.system import MEBIBYTE
 from polarguide.results.evaluation.record import code_digest
-from polarguide.runs.folder import CHECKPOINT, LOG
+from polarguide.runs.folder import CHECKPOINT, RunLog
 from polarguide_bench.children import (
     POLL_SECONDS,
     STDERR,
@@ -210,8 +208,6 @@ def _mib(memory: int) -> int:
 
 SLOTS_SECONDS = 1.0
 """Interval between queries to a scheduler, which may be remote, in seconds."""
-TAIL_BYTES = 4096
-"""Number of bytes at the end of a log that are searched for its last row."""
 MOST_LOSSES = 10
 """Largest number of losses of a job without a new checkpoint. After more losses, memory is probably insufficient."""
 
@@ -249,11 +245,14 @@ def run_job(label: str, run: Path, tasks: Callable[[], Sequence[Task]], steps: i
 
 def training_progress(run: Path, steps: int) -> tuple[int, str]:
     """Return the number of finished training steps and a note about the last one, read from the log."""
-    row = last_row(run / LOG)
-    if row is None or row.psnr is None:
+    try:
+        row = RunLog(run).rows()[-1]
+    except (PolarguideError, IndexError):
         return 0, ""
-    count = "" if row.gaussians is None else f"  {row.gaussians:,} Gaussians"
-    return min(steps, row.step + 1), f"PSNR {row.psnr:.1f} dB{count}"
+    if row["psnr"] is None:
+        return 0, ""
+    count = "" if row["gaussians"] is None else f"  {row['gaussians']:,} Gaussians"
+    return min(steps, row["step"] + 1), f"PSNR {row['psnr']:.1f} dB{count}"
 
 
 @dataclass(frozen=True)
@@ -404,30 +403,3 @@ def _stop(futures: Sequence[Future], client: Client) -> None:
                 time.sleep(POLL_SECONDS)
         except KeyboardInterrupt:
             client.run(kill, keys)
-
-
-class LogRow(msgspec.Struct):
-    """Fields in a row of a training log that are needed to show progress."""
-
-    step: Annotated[int, msgspec.Meta(ge=0)]
-    psnr: float | None = None
-    gaussians: int | None = None
-
-
-_ROWS = msgspec.json.Decoder(LogRow)
-
-
-def last_row(log: Path) -> LogRow | None:
-    """Return the last complete row of a log, or None if there is no complete row."""
-    try:
-        if not log.is_file():  # reading a pipe may never end
-            return None
-        with open(log, "rb") as file:
-            file.seek(max(0, log.stat().st_size - TAIL_BYTES))
-            lines = file.read(TAIL_BYTES).split(b"\n")
-    except OSError:
-        return None
-    for line in reversed(lines):
-        with contextlib.suppress(ValueError, RecursionError):  # an empty or incomplete line
-            return _ROWS.decode(line)
-    return None

@@ -7,7 +7,6 @@ import importlib
 import io
 import re
 import shlex
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,11 +18,11 @@ import polarguide
 from polarguide.cli.console import ConsoleReporter, say, set_threads
 from polarguide.core.errors import PolarguideError, require, require_package
 from polarguide.core.files import read_rows, stored
-from polarguide.core.options import EXPORT_PACKAGES, SceneOptions, check_finite
+from polarguide.core.options import EXPORT_PACKAGES, SceneOptions
 from polarguide.core.text import canonical, whole_number
 from polarguide.preparation.settings import CalibrationOptions, PrepareSettings
 from polarguide.training.settings import Background, Materials, TrainSettings
-from polarguide_bench.children import NO_FILES, Capture, source_stamp
+from polarguide_bench.children import Capture
 from polarguide_bench.options import BatchOptions, BenchOptions, CompareOptions, LayoutName
 
 if TYPE_CHECKING:
@@ -223,7 +222,6 @@ def batch(
     *,
     out: Path,
     options: str = "",
-    watch: float | None = None,
     settings: Annotated[BatchOptions, tyro.conf.arg(name="")],
 ) -> None:
     """Prepare, inspect, train, score, share and export every capture of a collection, with one overview page.
@@ -238,74 +236,31 @@ def batch(
         out: Output folder.
         options: Options of prepare and train for all captures: --options="--poses sfm --steps 3000". Those of a line of
             the CSV file override them. --recipe accepts several recipes.
-        watch: Look for new captures every so many seconds, until Ctrl-C, as at a capture station. A capture starts once
-            nothing in its folder has changed between two looks.
     """
     set_threads(settings.threads)
     for kind in settings.formats:
         for package in EXPORT_PACKAGES.get(kind, ()):
             require_package(package, f"--formats {kind}")
-
-    def process(lines: Sequence[_Line]) -> None:
-        module = importlib.import_module("polarguide_bench.batch")
-        captures = [_capture(line, module.is_posed_scene(line.path), options) for line in lines]
-        rows = module.run_batch(captures, out, settings, reporter=ConsoleReporter())
-        say(f"page: {out / 'index.html'}   table: {out / 'results.csv'}")
-        failed = {row.name: f"{row.name}: {row.error}" for row in rows if row.state == "failed"}
-        require(
-            not failed,
-            out,
-            expected=f"{len(captures)} finished captures",
-            found=f"{len(failed)} failed captures ({'; '.join(failed.values())})",
-            remedy="All other captures are finished. Remove the cause, and repeat the command.",
-        )
-
-    if watch is None:
-        lines = _lines(collection, out)
-        require(
-            lines,
-            collection,
-            expected="a folder of captures, or a table of captures",
-            found="no capture",
-            remedy="Put each capture into its own folder, or write a CSV file with the columns name and path.",
-        )
-        process(lines)
-    else:
-        check_finite("watch", watch, 1, 86_400)
-        if not collection.is_file():
-            _folders(collection, out)  # reports a missing folder; an empty one is valid
-        _watch(lambda: _lines(collection, out), process, watch)
-
-
-def _watch(
-    look: Callable[[], Sequence[_Line]], process: Callable[[Sequence[_Line]], None], seconds: float
-) -> None:
-    """Process new captures until KeyboardInterrupt. An error is printed once and does not stop the loop.
-
-    Args:
-        look: function that returns the captures that exist now.
-        process: function that processes the complete captures. It is called if one of them is new or has changed.
-        seconds: interval between two looks.
-    """
-    say(f"looking for captures every {seconds:g} seconds; Ctrl-C ends it")
-    earlier: dict[str, tuple[int, int, int]] = {}
-    processed: dict[str, tuple[int, int, int]] = {}
-    last_error = ""
-    while True:
-        try:
-            lines = look()
-            now = {line.name: source_stamp(line.path) for line in lines}
-            complete = [line for line in lines if NO_FILES != now[line.name] == earlier.get(line.name)]
-            earlier = now
-            stamps = {line.name: now[line.name] for line in complete}
-            if not stamps.items() <= processed.items():
-                processed |= stamps
-                process(complete)
-        except PolarguideError as error:
-            if str(error) != last_error:
-                say(str(error))
-            last_error = str(error)
-        time.sleep(seconds)
+    lines = _lines(collection, out)
+    require(
+        lines,
+        collection,
+        expected="a folder of captures, or a table of captures",
+        found="no capture",
+        remedy="Put each capture into its own folder, or write a CSV file with the columns name and path.",
+    )
+    module = importlib.import_module("polarguide_bench.batch")
+    captures = [_capture(line, module.is_posed_scene(line.path), options) for line in lines]
+    rows = module.run_batch(captures, out, settings, reporter=ConsoleReporter())
+    say(f"page: {out / 'index.html'}   table: {out / 'results.csv'}")
+    failed = {row.name: f"{row.name}: {row.error}" for row in rows if row.state == "failed"}
+    require(
+        not failed,
+        out,
+        expected=f"{len(captures)} finished captures",
+        found=f"{len(failed)} failed captures ({'; '.join(failed.values())})",
+        remedy="All other captures are finished. Remove the cause, and repeat the command.",
+    )
 
 
 @dataclass(frozen=True)

@@ -62,7 +62,6 @@ from polarguide.core.files import require_file
 from polarguide.core.options import check_finite, index_of
 from polarguide.core.text import decimals
 from polarguide.geometry.camera import Camera
-from polarguide.geometry.vectors import dot, unit
 from polarguide_shots.exposures import find_shots
 from polarguide_shots.fit import DARK_SNR, maps_of_set
 from polarguide_shots.maps import (
@@ -351,14 +350,17 @@ def surface_maps(
     names = ("specular_paper", "diffuse_paper", "specular_exact", "diffuse_exact")
     depths = {"normal": 3, **{name: int(channels) for name in names}}
     layers = {key: torch.empty((depth, height, width)).movedim(0, -1) for key, depth in depths.items()}
-    stokes, dolp, aolp = (torch.from_numpy(a) for a in (maps.stokes, maps.dolp, maps.aolp))
+    stokes = torch.from_numpy(maps.stokes)
+    dolp = torch.from_numpy(maps.dolp)
     for part in tiles(height, width):
         rays = torch.tensor([0.0, 0.0, 1.0]) if camera is None else camera.rays()[part]
         s = optics.stokes(torch.from_numpy(maps.intensities[:, part]))
-        zenith, normal = _nearest_normal(stokes[0, part], dolp[part], aolp[part], rays, refractive_index)
-        paper = optics.paper_separation(s, zenith[0], refractive_index)
+        candidates = optics.physical_candidates(stokes[:, part], rays, refractive_index)
+        normal = optics.disambiguate(candidates, torch.tensor(TOWARD)).normal
+        zeniths[0, part] = optics.diffuse_zenith(dolp[part], refractive_index)
+        zeniths[1, part], zeniths[2, part] = optics.specular_zeniths(dolp[part], refractive_index)
+        paper = optics.paper_separation(s, zeniths[0, part], refractive_index)
         exact = optics.exact_separation(s, normal, rays, refractive_index)
-        zeniths[:, part] = zenith
         conditioned[part] = exact.conditioned
         normal = normal * torch.from_numpy(maps.usable[part])[..., None]
         values = (normal, paper.specular, paper.diffuse, exact.specular, exact.diffuse)
@@ -372,48 +374,6 @@ def surface_maps(
         refractive_index=refractive_index,
         perspective=camera is not None,
     )
-
-
-def _nearest_normal(
-    s0: Tensor, dolp: Tensor, aolp: Tensor, rays: Tensor, index: float
-) -> tuple[Tensor, Tensor]:
-    """Return the zeniths [3, ...] of the candidates of the normal, and the candidate nearest to ``TOWARD``.
-
-    The result equals that of ``optics.disambiguate``, but only three of the six candidates are computed. The candidates
-    form pairs that are half a turn apart. The nearer candidate of a pair is on the side of the prior.
-    """
-    below, above = optics.specular_zeniths(dolp, index)
-    zeniths = torch.stack((optics.diffuse_zenith(dolp, index), below, above))
-    guess = unit(torch.tensor(TOWARD))
-    x_ref, up_ref = optics.lens_frame(rays)
-    right = dot(x_ref, guess)
-    up = dot(up_ref, guess)
-    along = dot(rays, guess)
-    cosine = torch.cos(aolp)
-    sine = torch.sin(aolp)
-    # Components of the prior across the ray, at azimuth AoLP and a quarter turn from it.
-    diffuse_side = cosine * right + sine * up
-    specular_side = cosine * up - sine * right
-    sines = torch.sin(zeniths)
-    cosines = torch.cos(zeniths)
-    possible = (dolp <= optics.diffuse_dolp_limit(index)) | (s0 <= 0)
-    score = torch.where(possible, sines[0] * diffuse_side.abs() - cosines[0] * along, -4.0)
-    sine_z = sines[0]
-    cosine_z = cosines[0]
-    specular = torch.zeros_like(possible)
-    for sine_k, cosine_k in zip(sines[1:], cosines[1:], strict=True):
-        other = sine_k * specular_side.abs() - cosine_k * along
-        nearer = other > score
-        score = torch.maximum(score, other)
-        specular = specular | nearer
-        sine_z = torch.where(nearer, sine_k, sine_z)
-        cosine_z = torch.where(nearer, cosine_k, cosine_z)
-    sign = torch.where(torch.where(specular, specular_side, diffuse_side) < 0, -sine_z, sine_z)
-    x = torch.where(specular, -sine, cosine) * sign
-    y = torch.where(specular, cosine, sine) * sign
-    axes = zip(*(v.unbind(-1) for v in (x_ref, up_ref, rays)), strict=True)
-    # The layout in memory is by component, as later steps read it.
-    return zeniths, torch.stack([x * a + y * b - cosine_z * ray for a, b, ray in axes]).movedim(0, -1)
 
 
 NAME = "array"

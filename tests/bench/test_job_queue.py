@@ -22,7 +22,15 @@ from polarguide.runs.folder import CHECKPOINT, LOG
 from polarguide.training.settings import TrainSettings
 from polarguide_bench import children, worker
 from polarguide_bench.children import COMMAND, Message, Scoring, Training, files_digest
-from polarguide_bench.job_queue import MOST_LOSSES, Job, Workers, last_row, run_job, run_jobs, workers
+from polarguide_bench.job_queue import (
+    MOST_LOSSES,
+    Job,
+    Workers,
+    run_job,
+    run_jobs,
+    training_progress,
+    workers,
+)
 from polarguide_bench.options import ClusterOptions
 
 # Reads its task, records its start, and behaves as the name of the device requests.
@@ -215,25 +223,29 @@ def test_the_library_installs_no_signal_handlers(two: Workers, job: Callable[...
     assert all(handlers == before for handlers in during)
 
 
-def test_the_last_row_of_a_log(tmp_path: Path) -> None:
+NO_PROGRESS = (0, "")
+
+
+def test_progress_is_the_last_row_of_a_log(tmp_path: Path) -> None:
     log = tmp_path / "log.jsonl"
-    assert last_row(log) is None
-    log.write_text('{"step": 9}\n' * 1000 + '{"step": 19}\n{"st')
-    row = last_row(log)
-    assert row.step == 19
+    assert training_progress(tmp_path, 30) == NO_PROGRESS
+    log.write_text('{"step": 9, "psnr": 20.0}\n{"step": 19, "psnr": 21.0, "gaussians": 1234}\n{"st')
+    assert training_progress(tmp_path, 30) == (20, "PSNR 21.0 dB  1,234 Gaussians")
+    log.write_text('{"step": 9, "psnr": 20.0}\n')
+    assert training_progress(tmp_path, 30) == (10, "PSNR 20.0 dB")
     log.write_text("nonsense\n")
-    assert last_row(log) is None
+    assert training_progress(tmp_path, 30) == NO_PROGRESS
 
 
 @pytest.mark.parametrize("text", ["[" * 4000, '{"step": "x"}', '{"step": 1e400}', '{"step": -1}', "{}"])
 def test_lines_that_are_none(tmp_path: Path, text: str) -> None:
     (tmp_path / "log.jsonl").write_text(text + "\n")
-    assert last_row(tmp_path / "log.jsonl") is None
+    assert training_progress(tmp_path, 30) == NO_PROGRESS
 
 
 def test_a_log_that_is_a_pipe(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "log.jsonl")
-    assert last_row(tmp_path / "log.jsonl") is None
+    assert training_progress(tmp_path, 30) == NO_PROGRESS
 
 
 @pytest.mark.parametrize("name", ["stderr.txt", "log.jsonl"])

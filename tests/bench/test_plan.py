@@ -65,7 +65,6 @@ def test_the_same_question_has_the_same_folders() -> None:
     [
         {"settings": TrainSettings(41, 0)},
         {"settings": TrainSettings(40, 0, 1.33)},
-        {"settings": TrainSettings(40, 0, views_per_step=2)},
         {"downscale": 2},
         {"transfer": "srgb"},
     ],

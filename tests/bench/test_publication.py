@@ -6,11 +6,9 @@ import pytest
 from comparison_records import results, run
 from faults import Fault
 
-import polarguide
-from polarguide.training.settings import TrainSettings
 from polarguide_bench.join import LAYOUTS, join_tables, measured_section, published_section
-from polarguide_bench.options import CompareOptions
 from polarguide_bench.recipes import recipe_named
+from polarguide_bench.tables import write_tables
 
 FIRST = LAYOUTS["publication-1"]
 
@@ -82,15 +80,11 @@ def test_values_of_another_version_of_a_recipe_are_named() -> None:
     assert named[0].startswith("polarguide-paper ")
 
 
-@pytest.mark.slow
-def test_one_command_makes_each_table(demo_scene: Path, tmp_path: Path) -> None:
-    """From trainings of a few steps of recipes that both layouts have."""
+def test_one_command_makes_each_table(tmp_path: Path) -> None:
+    """From a comparison with recipes that both layouts have."""
     recipes = ["3dgs-dr", "polarguide-paper", "polarguide-paper:only-normals"]
-    options = CompareOptions(jobs=1, downscale=8, report_views=0, device="cpu")
-    compared = polarguide.compare(
-        [demo_scene], recipes, tmp_path / "runs", settings=TrainSettings(4), options=options
-    )
-    assert all(run.state == "done" for run in compared.record.runs)
+    (tmp_path / "runs").mkdir()
+    write_tables(tmp_path / "runs", results([run("x", name, 0, psnr=30.0) for name in recipes]))
     for layout in LAYOUTS.values():
         out = tmp_path / layout.name
         join_tables([tmp_path / "runs"], out, layout=layout.name)

@@ -9,7 +9,6 @@ from faults import Fault
 from polarguide.cli.app import run
 from polarguide_bench import batch as batches
 from polarguide_bench import verbs
-from polarguide_bench.batch import CaptureRow
 from polarguide_bench.children import Capture
 from polarguide_bench.options import BatchOptions
 
@@ -81,43 +80,3 @@ def test_tables_and_folders_name_captures(
     (tmp_path / "all" / "notes.txt").touch()
     assert run(["batch", str(tmp_path / "all"), "--out", str(tmp_path / "all" / "out")]) == 0
     assert [capture.name for capture in asked.pop()] == ["a", "b"]
-
-
-def test_a_watched_folder_is_taken_once_nothing_in_it_changes(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Copies arrive file by file; a capture that fails is told once, and the next one is awaited."""
-    asked: list[list[str]] = []
-
-    def instead(captures: list[Capture], out: Path, *_: Any, **__: Any) -> list[CaptureRow]:
-        asked.append([capture.name for capture in captures])
-        record: Any = None
-        return [
-            CaptureRow(name, "", "", out, "failed" if name == "b" else "done", "broken", record)
-            for name in asked[-1]
-        ]
-
-    def copied(name: str, file: str) -> None:
-        (tmp_path / "all" / name).mkdir(exist_ok=True)
-        (tmp_path / "all" / name / file).write_text(file)
-
-    coming = [lambda: copied("a", "1"), lambda: copied("a", "2"), lambda: None, lambda: copied("b", "1")]
-    expected = [[], [], [], [["a"]], [["a"]], [["a"], ["a", "b"]], [["a"], ["a", "b"]]]
-    monkeypatch.setattr(batches, "run_batch", instead)
-    (tmp_path / "all").mkdir()
-
-    def sleep(seconds: float) -> None:
-        assert asked == expected.pop(0)
-        if not expected:
-            raise KeyboardInterrupt
-        if coming:
-            coming.pop(0)()
-
-    monkeypatch.setattr(verbs.time, "sleep", sleep)
-    with pytest.raises(KeyboardInterrupt):
-        verbs.batch(tmp_path / "all", out=tmp_path / "out", watch=5, settings=OPTIONS)
-    printed = capsys.readouterr()
-    assert (printed.out + printed.err).count("broken") == 1
-    assert "no capture" not in printed.out + printed.err  # an empty station waits
-    nowhere = tmp_path / "nowhere"
-    Fault("nowhere", found="no such").raised_by(verbs.batch, nowhere, out=tmp_path, watch=5, settings=OPTIONS)

@@ -216,7 +216,7 @@ ELSEWHERE = {
     *(
         (verb, name)
         for verb in ("compare", "ablate")
-        for name in ("seed", "views_per_step", "gaussians", "begin_again", "materials")
+        for name in ("seed", "gaussians", "begin_again", "materials")
     ),
     ("train", "begin_again"),
     ("prepare", "calibration"),
@@ -244,7 +244,7 @@ def test_help_of_every_verb_names_and_explains_every_flag(
     for parameter in inspect.signature(function).parameters.values():
         kind, fields, explained = kinds[parameter.name], [parameter.name], about
         if dataclasses.is_dataclass(kind):
-            fields = [field.name for field in dataclasses.fields(kind)]
+            fields = [field.name for field in dataclasses.fields(kind) if field.init]
             explained = "\n".join(base.__doc__ or "" for base in kind.__mro__)
             fields = [name for name in fields if (verb, name) not in ELSEWHERE]
         for name in fields:

@@ -66,9 +66,8 @@ def product(tmp_path_factory: pytest.TempPathFactory) -> Product:
 
 @pytest.mark.slow
 def test_the_product_works_alone(product: Product, demo_scene: Path) -> None:
-    run = "runs/demo"
+    run = "runs/own"
     for words in (
-        ("demo", "--out", run, *SHORT),
         (
             "prepare",
             str(demo_scene / "polar"),
@@ -79,8 +78,9 @@ def test_the_product_works_alone(product: Product, demo_scene: Path) -> None:
             "--threads",
             "1",
         ),
-        ("train", "scene", "--out", "runs/own", "--downscale", "4", *SHORT),
-        ("eval", "runs/own", "--no-speed", "--threads", "1"),
+        ("train", "scene", "--out", run, "--downscale", "4", *SHORT),
+        ("eval", run, "--no-speed", "--threads", "1"),
+        ("render", run, "--threads", "1"),
         ("share", run, "--out", "page.html", "--threads", "1"),
         ("export", run, "--format", "ply", "--threads", "1"),
     ):

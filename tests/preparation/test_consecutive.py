@@ -19,9 +19,9 @@ from polarguide.capture.colmap.sfm import run_step
 from polarguide.capture.filter.camera_files import Lens, camera_groups
 from polarguide.capture.filter.consecutive import (
     chosen_matching,
-    numbered_like_angles,
     shots_of_one_place,
 )
+from polarguide.capture.layout import numbered_like_angles
 from polarguide.core.progress import Advance, Reporter
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import PrepareSettings

@@ -19,7 +19,7 @@ WRONG = {
 ACCEPTED = {("path", ""): "no path: pictures of the views"}
 """Values that pass, and why."""
 VERBS = (
-    (TRAIN, "steps seed threads downscale views-per-step checkpoint-every viewer-port", "refractive-index",
+    (TRAIN, "steps seed threads downscale checkpoint-every viewer-port", "refractive-index",
      "recipe device transfer"),
     (EVAL, "threads", "", "device"),
     ("render run --out new", "frames", "rotate-environment", "views layers path environment"),
@@ -53,7 +53,7 @@ CASES += [
     for command, option, value, words in (
         (train, "threads", "1025", "up to 1024"), (train, "threads", "-1", "0 or more"),
         (TRAIN, "seed", str(2**63), f"up to {2**63 - 1}"), (TRAIN, "seed", "-1", "0 or more"),
-        (TRAIN, "views-per-step", "4097", "up to 4096"), (TRAIN, "refractive-index", "nan", "between 1 and 4"),
+        (TRAIN, "refractive-index", "nan", "between 1 and 4"),
         (priors, "threshold", "nan", ""), (MOSAICS, "black-level", "inf", ""), (MOSAICS, "zero", "nan", ""),
     )
 ]  # fmt: skip

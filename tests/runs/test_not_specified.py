@@ -9,7 +9,7 @@ import pytest
 import polarguide
 
 SOURCES = Path(polarguide.__file__).parent
-SETTINGS = {"refractive_index", "background", "steps", "views_per_step", "gaussians", "memory"}
+SETTINGS = {"refractive_index", "background", "steps", "gaussians", "memory"}
 CONSTANTS = {"INDEX", "STEPS"}
 DECIDES = {"options.py", "runs/folder.py", "training/settings.py"}
 EXCEPT = {
@@ -112,7 +112,7 @@ def test_only_one_place_falls_back_on_a_number() -> None:
         "n = record.get('refractive_index', 1.5)",
         "if not settings.steps: pass",
         "limited = options.memory > 0",
-        "def train(*, views_per_step: int = 1): pass",
+        "def train(*, steps: int = 1): pass",
         "def train(scene, refractive_index=1.5): pass",
         "class A:\n    memory: float = 0.0",
         "class A:\n    refractive_index: float = field(default=1.5)",

@@ -162,7 +162,7 @@ def of_three_views(values: Tensor) -> Tensor:
     [
         (False, shorter, ["adam.means.exp_avg"], "adam.means.exp_avg"),
         (True, shorter, ["adam.means.exp_avg"], "adam.means.exp_avg"),
-        (True, of_three_views, ["statistics.gradient", "statistics.seen"], "a training with 3"),
+        (True, of_three_views, ["statistics.gradient", "statistics.seen"], "statistics.gradient of shape [3"),
     ],
 )
 def test_opening_and_going_on_check_alike(

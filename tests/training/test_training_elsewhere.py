@@ -50,16 +50,6 @@ def test_a_step_of_every_stage_stays_there_and_waits_for_nothing(tiny_scene: Sce
                 assert not again or device.waits == before, step
 
 
-def test_several_views_a_step_stay_there_too(tiny_scene: Scene) -> None:
-    with OtherDevice():
-        trainer = make_trainer(tiny_scene, RECIPES["polarguide"], STEPS, backend=BACKEND, views_per_step=2)
-        report = trainer.step()
-        gradient = trainer.state.tensors()["statistics.gradient"]
-    assert report.measured.device == THERE
-    assert gradient.shape == (2, len(trainer.state.gaussians))
-    assert gradient.device == THERE
-
-
 def test_a_training_stays_there_and_goes_on_from_its_checkpoint(
     tiny_scene: Scene, busy_recipe: Recipe, tmp_path: Path
 ) -> None:

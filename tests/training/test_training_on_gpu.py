@@ -84,9 +84,10 @@ def test_a_plain_step_waits_for_nothing_of_its_own(tiny_scene: Scene, name: str)
         torch.cuda.set_sync_debug_mode("error")
         strict = True
         try:
-            for slot in range(views):
-                trainer.backpropagate(slot)
+            for _ in range(views):
+                trainer.backpropagate()
                 trainer.update_parameters()
+                trainer.state.step += 1
         finally:
             strict = False
             torch.cuda.set_sync_debug_mode("default")

@@ -155,29 +155,6 @@ def test_the_page_cannot_be_framed_by_others(served: Served) -> None:
         assert answer.headers["X-Content-Type-Options"] == "nosniff"
 
 
-def test_a_flood_is_read_slowly(monkeypatch: pytest.MonkeyPatch) -> None:
-    slept = []
-
-    class Flood:
-        async def recv(self) -> bytes:
-            return b"x"
-
-    async def sleep(seconds: float) -> None:
-        slept.append(seconds)
-
-    async def read(count: int) -> None:
-        for _ in range(count):
-            await connection.recv()
-
-    monkeypatch.setattr("polarguide.viewer.guard.time.monotonic", lambda: 5.0)
-    monkeypatch.setattr("polarguide.viewer.guard.asyncio.sleep", sleep)
-    connection = guard._Connection(Flood(), lambda raw: raw)
-    asyncio.run(read(int(guard.BURST)))
-    assert slept == []
-    asyncio.run(read(2))
-    assert slept == pytest.approx([1 / guard.MESSAGES_PER_SECOND, 2 / guard.MESSAGES_PER_SECOND])
-
-
 def test_a_browser_that_takes_nothing_is_let_go(monkeypatch: pytest.MonkeyPatch) -> None:
     aborted = []
 

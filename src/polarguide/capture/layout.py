@@ -24,7 +24,6 @@ from polarguide.core.text import canonical, listed, stem_of
 _PICTURE_STEM = re.compile(r"(?P<view>.+)_(?P<angle>000|045|090|135)")
 _ANGLE_FOLDER = re.compile(r"(?:(?:i|pol|angle)[-_ ]?|[_ ])?(?P<angle>\d{1,3})(?:deg)?", re.IGNORECASE)
 _READ_FOLDERS = ("polar", "masks", "materials", "invalid", "gt", "sparse")
-_NUMBER = re.compile(r"(?<!\d)\d{1,3}(?!\d)")
 _HINT = (
     "Convert camera files with polarguide prepare FOLDER --out SCENE. Otherwise use a folder with "
     "polar/<view>_000.png, _045.png, _090.png and _135.png, or with the four folders I-00, I-45, I-90 and I-135 "
@@ -294,20 +293,21 @@ def angle_folders(root: Path) -> dict[int, Path]:
         if angle in folders:
             raise ambiguous(root, f"one folder for {angle} degrees", folders[angle], path)
         folders[angle] = path
-    return dict(sorted((folders or _numbered_folders(children)).items()))
+    sets = [] if folders else numbered_like_angles(children)
+    return dict(sorted((sets[0] if len(sets) == 1 else folders).items()))
 
 
-def _numbered_folders(folders: Sequence[Path]) -> dict[int, Path]:
-    """Return four folders by angle whose names differ in one number: 0, 45, 90 or 135.
+def numbered_like_angles(paths: Sequence[Path]) -> list[dict[int, Path]]:
+    """Return sets of four files or folders by angle whose names differ in one number: 0, 45, 90 or 135.
 
-    The result is empty if there are no such folders, or several sets of them.
+    Examples are cup_P45.png, cup(45).png and 45_cup.png.
     """
-    sets: dict[tuple[str, str], dict[int, Path]] = {}
-    for path in folders:
-        for match in _NUMBER.finditer(path.name):
-            sets.setdefault((path.name[: match.start()], path.name[match.end() :]), {})[int(match[0])] = path
-    complete = [by_angle for by_angle in sets.values() if set(by_angle) == set(ANGLES)]
-    return complete[0] if len(complete) == 1 else {}
+    sets: dict[tuple[Path, str, str], dict[int, Path]] = {}
+    for path in paths:
+        for number in re.finditer(r"\d+", path.name):
+            around = (path.parent, path.name[: number.start()], path.name[number.end() :])
+            sets.setdefault(around, {})[int(number[0])] = path
+    return [by_angle for by_angle in sets.values() if sorted(by_angle) == list(ANGLES)]
 
 
 def angle_of_folder(path: Path) -> int | None:

@@ -112,66 +112,50 @@ class Densification:
 class DensityStatistics:
     """Gradient statistics of each Gaussian, from which the density control decides.
 
-    The norms of the screen-space gradients are summed over the pictures in which the Gaussian was visible. With several
-    views per step, each slot of a step has its own sums, which are added when the mean is computed.
+    The norms of the screen-space gradients are summed over the pictures in which the Gaussian was visible.
 
     Args:
         count: number N of Gaussians.
-        slots: number S of views per step.
         device: device of the Gaussians.
 
     Attributes:
-        gradient: sums of the gradient norms, [N], or [S, N] for more than one slot.
-        seen: numbers of pictures in which each Gaussian was visible, in the same shape.
+        gradient: sums of the gradient norms, [N].
+        seen: numbers of pictures in which each Gaussian was visible, [N].
     """
 
-    def __init__(self, count: int, slots: int = 1, device: torch.device | None = None) -> None:
-        self._slots = slots
+    def __init__(self, count: int, device: torch.device | None = None) -> None:
         self._device = device
         self.clear(count)
 
     @classmethod
     def of(cls, gradient: Tensor, counts: Tensor) -> DensityStatistics:
         """Create statistics from existing sums."""
-        statistics = cls(0, gradient.shape[0] if gradient.ndim == 2 else 1, gradient.device)
+        statistics = cls(0, gradient.device)
         statistics.gradient = gradient
         statistics.seen = counts
         return statistics
 
-    def add(self, screen_gradient: Tensor, radii: Tensor, width: int, height: int, slot: int = 0) -> None:
+    def add(self, screen_gradient: Tensor, radii: Tensor, width: int, height: int) -> None:
         """Add one picture.
 
         Args:
             screen_gradient: [N, 2] gradient per pixel, which is converted to units of half a picture.
             radii: [N] radii in pixels; 0 for invisible Gaussians.
             width, height: size of the picture.
-            slot: slot of the view.
         """
         x, y = screen_gradient.unbind(1)
         norm = torch.stack((x * (width / 2), y * (height / 2)), dim=1).norm(dim=1)
-        gradient, counts = (t[slot] if t.ndim == 2 else t for t in (self.gradient, self.seen))
-        gradient += norm
-        counts += (radii > 0).to(counts)
+        self.gradient += norm
+        self.seen += (radii > 0).to(self.seen)
 
     def mean(self) -> Tensor:
         """Return the mean gradient norm, [N]; 0 for invisible Gaussians."""
-        gradient, counts = (_in_order(t) for t in (self.gradient, self.seen))
-        return gradient / counts.clamp(min=1)
+        return self.gradient / self.seen.clamp(min=1)
 
     def clear(self, count: int) -> None:
         """Reset the sums for ``count`` Gaussians."""
-        shape = (count,) if self._slots == 1 else (self._slots, count)
-        self.gradient, self.seen = (torch.zeros(shape, device=self._device) for _ in range(2))
-
-
-def _in_order(sums: Tensor) -> Tensor:
-    """Add sums [S, N] in the order of the slots. Sums [N] are returned unchanged."""
-    if sums.ndim == 1:
-        return sums
-    total = sums[0]
-    for further in sums[1:]:
-        total = total + further
-    return total
+        self.gradient = torch.zeros(count, device=self._device)
+        self.seen = torch.zeros(count, device=self._device)
 
 
 @torch.no_grad()

@@ -132,15 +132,6 @@ class Trained:
         """Learning rates of the trained tensors by name."""
         return dict(self._adam.rates)
 
-    @property
-    def betas(self) -> tuple[float, float]:
-        """Decay of Adam's moments."""
-        return self._adam.betas
-
-    def set_betas(self, betas: tuple[float, float]) -> None:
-        """Set the decay of Adam's moments, which is 0.9 and 0.999 by default."""
-        self._adam.betas = betas
-
     def set_rate(self, name: str, rate: float) -> None:
         """Set the learning rate of one tensor, if it is trained."""
         if name in self._adam.rates:

@@ -32,7 +32,6 @@ from polarguide.capture.metadata import (
 from polarguide.capture.point_exposures import PointExposures
 from polarguide.capture.scene import chosen_views, read_views
 from polarguide.capture.view import FULL_CODE
-from polarguide.capture.view_reader import ViewData
 from polarguide.core.files import read_file
 from polarguide.core.options import check_choice
 from polarguide.core.progress import SILENT, Reporter
@@ -175,7 +174,16 @@ def read_capture(
         name=root.resolve().name,
         layout=layout,
         views=tuple(
-            _inspected_view(item, camera, stored.full_scale)
+            InspectedView(
+                name=item.name,
+                codes=torch.from_numpy(item.codes),
+                invalid=torch.from_numpy(item.invalid),
+                saturated=torch.from_numpy(item.saturated(stored.full_scale)),
+                black=torch.from_numpy(item.black),
+                camera=camera,
+                peak=int(item.peak.max()),
+                exposures=item.exposures,
+            )
             for item, camera in zip(stored.data, stored.cameras, strict=True)
         ),
         model=model,
@@ -199,19 +207,6 @@ def _test_names(path: Path, names: Sequence[str], model: ColmapModel | None) -> 
         return held_out(path, read_file(path, largest=LARGEST_RECORD), list(names))
     posed = frozenset(() if model is None else model.names)
     return chosen_views({name: model.camera(name) for name in names if model and name in posed}, "directions")
-
-
-def _inspected_view(item: ViewData, camera: Camera | None, full_scale: int | None) -> InspectedView:
-    return InspectedView(
-        name=item.name,
-        codes=torch.from_numpy(item.codes),
-        invalid=torch.from_numpy(item.invalid),
-        saturated=torch.from_numpy(item.saturated(full_scale)),
-        black=torch.from_numpy(item.black),
-        camera=camera,
-        peak=int(item.peak.max()),
-        exposures=item.exposures,
-    )
 
 
 MEASURABLE = 1.0 / 256.0

@@ -726,18 +726,10 @@ def _say_origin(
             f"by {scatter:.1%} (robust standard deviation)."
         )
     elif compared is not None and by_points:
-        gains = compared.significant[:, 0]
-        applied = int(np.count_nonzero(np.nan_to_num(gains)))
-        error = float(np.median(compared.errors))
-        significance = f"They do not differ significantly (error {error:.0%}) and are not applied."
-        if applied:
-            known = int(np.isfinite(gains).sum())
-            significance = (
-                f"{known - applied} of {known} are not significant (error {error:.0%}) and not applied."
-            )
+        applied = int(np.count_nonzero(np.nan_to_num(compared.significant[:, 0])))
         reporter.say(
-            f"Gains: from shared points ({by_points} of {count} views). The files do not state exposures. "
-            f"{significance}"
+            f"Gains: from shared points ({by_points} of {count} views). The files do not state exposures. {applied} "
+            f"gains are significant and applied (error {float(np.median(compared.errors)):.0%})."
         )
     elif by_files:
         reporter.say(f"Gains: exposures that the files state ({by_files} of {count} views).")

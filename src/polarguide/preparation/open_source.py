@@ -21,12 +21,11 @@ from polarguide.capture.filter.camera_files import QUARTER_TURNS, TURNS
 from polarguide.capture.filter.consecutive import (
     extract_frames,
     find_videos,
-    numbered_like_angles,
     shots_of_one_place,
 )
 from polarguide.capture.filter.shots import SHOT_SUFFIXES, find_shots
 from polarguide.capture.formats.pictures import SUFFIXES, decode_picture, read_picture
-from polarguide.capture.layout import angle_folders, describe_contents
+from polarguide.capture.layout import angle_folders, describe_contents, numbered_like_angles
 from polarguide.capture.pose_files import SUFFIXES as POSE_FILES
 from polarguide.capture.pose_files import TEST, parts_of_poses, read_parts
 from polarguide.capture.sensor.pattern import SENSOR_NAMES
@@ -202,7 +201,8 @@ def _require_photographs(root: Path) -> None:
         not numbered,
         root,
         expected="angles as in cup_45 or in folders 0, 45, 90 and 135",
-        found=f"pictures with angles in another form ({listed([p.name for p in numbered])})",
+        found=f"pictures with angles in another form "
+        f"({listed([path.name for group in numbered[:1] for path in group.values()])})",
         remedy="Rename them. Ordinary photographs without a filter: --angles none.",
     )
     each = shots_of_one_place(files)

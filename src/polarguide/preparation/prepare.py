@@ -384,8 +384,6 @@ def prepare_scene(
     if poses is not None:
         for note in filter(None, (frames, *poses.notes)):
             reporter.say(note)
-        for warning in poses.warnings:
-            reporter.warn(warning)
     unused = [f"--poses {shlex.quote(str(root / name))}" for name in POSE_NAMES if (root / name).exists()]
     if unused and settings.poses == "sfm":
         options = " or ".join(unused)
@@ -436,7 +434,7 @@ def _write_scene(
         reporter.warn(
             f"{len(poses.missing)} of {len(pictures.views)} views have no pose and are skipped "
             f"({listed(poses.missing)})."
-            + "".join(f" {folder} is another model, with {count} views." for folder, count in poses.others())
+            + (f" Other models: {listed([str(folder) for folder in poses.others])}." if poses.others else "")
         )
     _write_views(folder, pictures, poses, reporter)
     if note := _turns(folder):

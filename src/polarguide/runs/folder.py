@@ -311,12 +311,13 @@ class _Row(msgspec.Struct):
     alone: bool = True
     psnr: float | None = None
     held_out: float | None = None
+    gaussians: int | None = None
 
 
 _ROWS = msgspec.json.Decoder(_Row)
 
 
-OPEN = ("steps", "refractive_index", "views_per_step", "background")
+OPEN = ("steps", "refractive_index", "background")
 """Settings that ``resolve`` completes if they are not specified.
 
 The number of Gaussians is not listed, because it is needed before pictures are read.
@@ -373,7 +374,6 @@ def resolve(
         **vars(settings),
         "steps": _steps(sizes),
         "refractive_index": index_of(None, scene.refractive_index),
-        "views_per_step": 1,
         **recorded,
         "gaussians": most_gaussians(sum(sizes), method, settings, resumed),
         **settings.specified(),

@@ -156,7 +156,7 @@ def _resumed_state(
     state = None
     if os.path.lexists(out / CHECKPOINT):  # a broken link is an error, not a missing file
         state = load_checkpoint(out, recipe, torch.device(configuration.device))
-        _check_state(state, configuration.settings, out)
+        check_step(state.step, configuration.settings, out)
     else:
         reporter.say(f"{out} has no checkpoint: the training begins at step 0")
     return state
@@ -251,20 +251,6 @@ def check_same_run(old: RunConfiguration, new: RunConfiguration, out: Path) -> N
                 found="none" if b is None else json.dumps(b, default=str)[:120],
                 remedy="Resume with the same scene, options and program version, or train into a new folder.",
             )
-
-
-def _check_state(state: TrainingState, settings: ResolvedSettings, out: Path) -> None:
-    """Check that a checkpoint matches the settings of its run."""
-    check_step(state.step, settings, out)
-    sums = state.extra["statistics.gradient"]
-    views = sums.shape[0] if sums.ndim == 2 else 1
-    if views != settings.views_per_step:
-        raise PolarguideError(
-            out / CHECKPOINT,
-            expected=f"the state of a training with {settings.views_per_step} views a step",
-            found=f"a training with {views}",
-            remedy="Train again into a new folder.",
-        )
 
 
 def check_step(step: int, settings: ResolvedSettings, out: Path) -> None:

@@ -45,8 +45,8 @@ class Callback(Generic[LoopKind]):
     def act(self, loop: LoopKind) -> None:
         """Perform the action. Several callbacks with the same action run in the order of the callbacks."""
 
-    def after_backward(self, loop: LoopKind, step: Step, slot: int) -> None:
-        """Run after the gradients of one view of a step have been added; ``slot`` is the number of that view."""
+    def after_backward(self, loop: LoopKind, step: Step) -> None:
+        """Run after the gradients of a step have been computed."""
 
     def after_step(self, loop: LoopKind, report: StepReport) -> None:
         """Run after a step; ``loop.state.step`` is the number of finished steps."""

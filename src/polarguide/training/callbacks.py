@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import NamedTuple
@@ -143,20 +142,6 @@ def touched_pixels(gaussians: Parameters, cameras: Iterable[Camera], rasterize: 
     return PixelCounts(views, most)
 
 
-class LargeBatch(Callback[TrainingLoop]):
-    """Callback that adapts the decay and the rates of Adam to the number of views per step, see ``TrainSettings``."""
-
-    def begin(self, loop: TrainingLoop) -> None:
-        views = loop.settings.views_per_step
-        if views == 1:
-            return
-        for optimized in loop.state.optimized:
-            optimized.set_betas((0.9**views, 0.999**views))
-        if loop.state.environment is not None:
-            for name, rate in loop.current.recipe.light_rates.items():
-                loop.state.environment.set_rate(name, rate * math.sqrt(views))
-
-
 class OpacityReset(Callback[TrainingLoop]):
     """Callback that resets the opacities to a small value."""
 
@@ -255,8 +240,7 @@ class PriorRefresh(Callback[TrainingLoop]):
         loop.feed.guide = self._guide
         if self._guide or not position.stage.weights.priors or self.action in position.actions:
             return
-        slots = range(loop.settings.views_per_step)
-        if any(loop.feed.view_at(loop.state.step, slot).is_determined for slot in slots):
+        if loop.feed.view_at(loop.state.step).is_determined:
             loop.position = replace(position, actions=(*position.actions, self.action))
 
     def act(self, loop: TrainingLoop) -> None:
@@ -286,15 +270,15 @@ class DensityControl(Callback[TrainingLoop]):
         empty = free_space(context.scene.points, cameras, density.free_share, density.free_quantile)
         self._empty = empty.to(device)
         means = loop.state.gaussians["means"]
-        self._statistics = DensityStatistics(len(means), context.settings.views_per_step, means.device)
+        self._statistics = DensityStatistics(len(means), means.device)
 
-    def after_backward(self, loop: TrainingLoop, step: Step, slot: int) -> None:
+    def after_backward(self, loop: TrainingLoop, step: Step) -> None:
         if step.statistic is None or step.statistic.gradient is None:
             return
         loop.whole = False
         camera = step.targets.camera
         radii = step.result.training["radii"]
-        self._statistics.add(step.statistic.gradient, radii, camera.width, camera.height, slot)
+        self._statistics.add(step.statistic.gradient, radii, camera.width, camera.height)
 
     def after_step(self, loop: TrainingLoop, report: StepReport) -> None:
         if not loop.position.stage.densify:
@@ -357,7 +341,6 @@ class Footprints(Callback[TrainingLoop]):
 def method_callbacks() -> list[AnyCallback]:
     """Return the callbacks of a training of Gaussians, in the order in which they run."""
     return [
-        LargeBatch(),
         OpacityReset(),
         NormalPropagation(),
         NormalOrientation(),

@@ -20,8 +20,6 @@ LARGEST_VALUE = 1e8
 """Largest absolute value of a parameter without a range of its own."""
 RANGES = {"means": (-1e12, 1e12), "log_scales": (-1e4, 60.0)}
 """Allowed ranges of parameters by name."""
-MOST_SLOTS = 4096
-"""Largest number of views per step."""
 MOST_STEPS = 1 << 50
 """Largest number of steps."""
 
@@ -92,7 +90,7 @@ def refuse_foreign(tensors: Mapping[str, Tensor], recipe: Recipe) -> None:
     if any(name.startswith("frozen.") for name in tensors):
         frozen = _count(tensors, "frozen.means")
         kinds["frozen"] = {name: (frozen, *shape) for name, shape in recipe.shapes.items()}
-    sums = TensorRule(_statistics_shape(tensors, count), 0.0)
+    sums = TensorRule((count,), 0.0)
     rules = {
         "statistics.gradient": sums,
         "statistics.seen": sums,
@@ -128,14 +126,6 @@ def _count(tensors: Mapping[str, Tensor], name: str) -> int:
     if means.ndim != 2 or not len(means):  # densification leaves at least one
         raise ValueError(f"{name} of shape {list(means.shape)}, not [N, 3] with N > 0")
     return len(means)
-
-
-def _statistics_shape(tensors: Mapping[str, Tensor], count: int) -> tuple[int, ...]:
-    """Return the shape of the sums of the density control: [N], or [S, N] for S views per step."""
-    shape = tuple(_tensor(tensors, "statistics.gradient").shape)
-    if shape == (count,) or (len(shape) == 2 and shape[1] == count and 1 < shape[0] <= MOST_SLOTS):
-        return shape
-    raise ValueError(f"statistics.gradient of shape {list(shape)}, not [{count}] or [S, {count}]")
 
 
 def _check_lengths(tensors: Mapping[str, Tensor], names: Iterable[str]) -> None:

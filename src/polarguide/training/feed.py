@@ -98,15 +98,14 @@ class Feed:
         """Return the prefix of the keys of cached entries for a step."""
         return "small " if step < self._until else ""
 
-    def view_at(self, step: int, slot: int = 0) -> View:
-        """Return the view of a slot of a step.
+    def view_at(self, step: int) -> View:
+        """Return the view of a step.
 
         Every epoch visits every training view once, in a new order.
         """
         views = self._views[self._size(step)]
-        settings = self._context.settings
-        epoch, place = divmod(step * settings.views_per_step + slot, len(views))
-        order = torch.randperm(len(views), generator=seeded(settings.seed, 4, epoch))
+        epoch, place = divmod(step, len(views))
+        order = torch.randperm(len(views), generator=seeded(self._context.settings.seed, 4, epoch))
         view = views[int(order[place])]
         exposures = self._exposures.get(view.name, view.exposures)
         return view if exposures == view.exposures else view.with_exposures(exposures)

@@ -6,10 +6,8 @@ without actions therefore copies nothing to the device and does not wait for it.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
-import torch
 from torch import Tensor
 
 from polarguide.gaussians.initialize import stretch_steps
@@ -41,7 +39,7 @@ class TrainingLoop(Loop):
         schedule: stages of the current schedule.
         feed: targets of the current schedule.
         position: stage and actions of this step.
-        rates: learning rates of this step by name, before the factor for several views.
+        rates: learning rates of this step by name.
     """
 
     state: TrainingState
@@ -90,22 +88,14 @@ class TrainingLoop(Loop):
                     callback.act(self)
 
     def optimize(self) -> tuple[Tensor, str, int]:
-        """Render the views of a step, and change the parameters by their mean gradient."""
-        views = self.settings.views_per_step
-        measured = [self.backpropagate(slot) for slot in range(views)]
+        """Render the view of a step, and change the parameters by its gradient."""
+        measured = self.backpropagate()
         self.whole = False
-        if views > 1:
-            trained = (*self.state.gaussians.trained(), *self.state.light.values())
-            torch._foreach_div_([t.grad for t in trained if t.grad is not None], float(views))
         self.update_parameters()
-        mean = measured[0] if len(measured) == 1 else torch.stack(measured).mean(dim=0)
-        return mean, self.position.stage.name, len(self.state.gaussians)
+        return measured, self.position.stage.name, len(self.state.gaussians)
 
-    def backpropagate(self, slot: int) -> Tensor:
-        """Render the view of a slot and add its gradients.
-
-        Args:
-            slot: number of the view in this step.
+    def backpropagate(self) -> Tensor:
+        """Render the view of a step and add its gradients.
 
         Returns:
             ``StepReport.measured``.
@@ -114,7 +104,7 @@ class TrainingLoop(Loop):
         state = self.state
         stage = self.position.stage
         shading = context.shading if stage.reflection else PLAIN
-        view = self.feed.view_at(state.step, slot)
+        view = self.feed.view_at(state.step)
         # Targets come first, since their computation and the rendering both need memory.
         targets = self.feed.targets(state.step, view, stage.weights)
         statistic = ScreenStatistic(COLOR_CHANNELS) if stage.densify else None
@@ -130,14 +120,13 @@ class TrainingLoop(Loop):
         loss = step_loss(step, stage.weights)
         loss.total.backward()
         for callback in self.callbacks:
-            callback.after_backward(self, step, slot)
+            callback.after_backward(self, step)
         return loss.measured()
 
     def update_parameters(self) -> None:
         """Update all parameters by Adam, with the learning rates of this step."""
-        factor = math.sqrt(self.settings.views_per_step)
         for name, rate in self.rates.items():
-            self.state.gaussians.set_rate(name, rate * factor)
+            self.state.gaussians.set_rate(name, rate)
         means = self.state.gaussians["means"].detach()
         before = means.clone()
         for optimized in self.state.optimized:

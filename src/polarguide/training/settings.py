@@ -11,8 +11,6 @@ import tyro
 from polarguide.core.errors import PolarguideError
 from polarguide.core.options import EXPOSURES, MOST, Exposures, check_choice, check_count
 
-MOST_VIEWS = 4096
-"""Largest number of views per step."""
 MOST_SEEDS = 2**63 - 1
 """Largest seed."""
 STEPS = 5000
@@ -36,18 +34,12 @@ class TrainSettings:
     None means not specified: the value is that of the run to resume or, in a new run, the one named below. run.json
     records the value.
 
-    The gradient of a step is the mean over its views. With B views, learning rates are those of the recipe times the
-    square root of B. Adam's decays are taken to the power of B, so that its memory spans the same number of views (Zhao
-    et al. 2024, "On scaling up 3D Gaussian splatting training").
-
     Attributes:
         steps: Number of optimizer steps. 3,000 show the scene, 5,000 and more settle it. None: 5,000 or, if larger, 60
             visits to each view; twice as many for pictures over a megapixel; the number of the recipe for a field.
         seed: Seed of every random draw.
         refractive_index: Refractive index of the surfaces: 1.5 for glass, plastic and glaze, 1.33 for water. None: the
             value in scene.json, or 1.5.
-        views_per_step: Number of views whose mean gradient makes a step. Learning rates grow with its square root. The
-            number of steps stays the same, so that more views are rendered. None: one.
         background: Background of the subject. scene: surroundings, which are reconstructed. black: no background, the
             pictures are black there. masked: no background, pixels outside masks/ are set to black. auto: black if the
             edges of the pictures are black, else scene.
@@ -64,7 +56,6 @@ class TrainSettings:
     steps: int | None = None
     seed: int = 0
     refractive_index: float | None = None
-    views_per_step: int | None = None
     background: Background = "auto"
     gaussians: int | None = None
     exposures: Exposures = "captured"
@@ -93,7 +84,8 @@ class ResolvedSettings:
     steps: int
     seed: int = 0
     refractive_index: float
-    views_per_step: int = 1
+    views_per_step: Literal[1] = 1
+    """Earlier versions could train on several views per step."""
     background: Background = "auto"
     gaussians: int = 0
     exposures: Exposures = "captured"
@@ -117,7 +109,6 @@ def _check_ranges(values: Mapping[str, Any], *, least_gaussians: int) -> None:
     for name, least, most in (
         ("steps", 1, MOST),
         ("gaussians", least_gaussians, MOST),
-        ("views_per_step", 1, MOST_VIEWS),
         ("seed", 0, MOST_SEEDS),
     ):
         if values[name] is not None:

@@ -17,7 +17,6 @@ import logging
 import math
 import re
 import threading
-import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 from urllib.parse import urlsplit
@@ -232,8 +231,6 @@ def _is_address(host: str) -> bool:
 
 
 MOST_BROWSERS = 32
-MESSAGES_PER_SECOND = 200.0
-BURST = 400.0  # number of messages
 SENDING_SECONDS = 30.0  # timeout of a browser that receives nothing
 # viser's page connects to any server that its URL names (?websocket=, ?playbackPath=) and trusts this server. The
 # policy restricts connections to the page's own origin. Not every browser applies 'self' to sockets.
@@ -332,13 +329,11 @@ def _handled(handler: Any, check: Check) -> Callable[[Any], Any]:
 
 
 class _Connection:
-    """Connection of a browser that validates messages, limits their rate, and has a timeout."""
+    """Connection of a browser that validates messages and has a timeout."""
 
     def __init__(self, connection: Any, check: Check) -> None:
         self._connection = connection
         self._check = check
-        self._left = BURST
-        self._since = time.monotonic()
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._connection, name)
@@ -350,7 +345,6 @@ class _Connection:
             raw = await self._connection.recv()
             if refused:  # messages that were already sent; then recv raises ConnectionClosed
                 continue
-            await self._pace()
             try:
                 message = self._check(raw)
             except Refused as error:
@@ -366,11 +360,3 @@ class _Connection:
             await asyncio.wait_for(self._connection.send(data), SENDING_SECONDS)
         except asyncio.TimeoutError:
             self._connection.transport.abort()
-
-    async def _pace(self) -> None:
-        """Limit the rate of messages to ``MESSAGES_PER_SECOND`` by waiting."""
-        now = time.monotonic()
-        self._left = min(BURST, self._left + (now - self._since) * MESSAGES_PER_SECOND) - 1
-        self._since = now
-        if self._left < 0:
-            await asyncio.sleep(-self._left / MESSAGES_PER_SECOND)

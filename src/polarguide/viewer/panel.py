@@ -105,7 +105,6 @@ def controls_of(options: PanelOptions) -> dict[str, dict[str, Control]]:
             "add_keyframe": Control("button", "Add keyframe"),
             "remove_keyframe": Control("button", "Remove last keyframe"),
             "seconds": Control("slider", "Seconds per segment", (*SECONDS, 0.5, 2.0), number(*SECONDS)),
-            "play": Control("button", "Play"),
             "save_path": Control("button", "Save path"),
         },
     }  # fmt: skip

@@ -14,7 +14,6 @@ from polarguide.core.records import to_json
 from polarguide.geometry.camera import Camera
 from polarguide.geometry.scene_frame import SceneFrame
 from polarguide.viewer.cameras import (
-    FRAMES_PER_SECOND,
     MOST_KEYFRAMES,
     Frusta,
     Photograph,
@@ -145,7 +144,6 @@ class Session:
         )
         self._screenshot = False
         self._written_at = dict[str, float]()
-        self._playing: tuple[float, list[Camera]] | None = None
         first = next(iter(photographs.values())).view.camera
         self._size = first.width, first.height
         self._keyframes: list[Camera] = []
@@ -169,7 +167,6 @@ class Session:
             "add_keyframe": self._add_keyframe,
             "remove_keyframe": self._remove_keyframe,
             "seconds": self._show_count,
-            "play": self._play,
             "save_path": self._save_path,
             "save": lambda: panel.show_note(self._save_presentation()),
         }
@@ -232,7 +229,6 @@ class Session:
     def go(self, name: str) -> None:
         """Move the camera to the pose of a photograph."""
         with self._lock:
-            self._playing = None
             view = self._photographs[name].view
             pose = move_to_view(self._client, view, self._scene_frame, time.monotonic())
             self._view_pose = self._last_pose = pose
@@ -277,43 +273,13 @@ class Session:
             text = path_json(self._path())
             self._client.send_file_download(PATH_FILE, text.encode(), save_immediately=True)
 
-    def _play(self) -> None:
-        if self._soon_again("play"):
-            return
-        path = self._path()
-        if len(path) > 1:
-            with self._lock:
-                self._view_pose = self._last_pose = None
-                self._playing = time.monotonic(), path
-            self.panel["view"].value = FREE_VIEW
-            self._wake()
-
     def _camera(self, frame_size: tuple[int, int]) -> Camera:
         camera = self._client.camera
         return free_camera(camera.wxyz, camera.position, camera.fov, frame_size)
 
-    def _follow_path(self) -> None:
-        """Move the browser's camera to the current pose of the animation."""
-        if self._playing is None:
-            return
-        began, path = self._playing
-        frame = int((time.monotonic() - began) * FRAMES_PER_SECOND)
-        if frame >= len(path):
-            self._playing = None
-            return
-        camera = self._client.camera
-        target = path[frame]
-        ahead = float(np.linalg.norm(camera.look_at - camera.position)) or self._scene_frame.distance
-        with self._client.atomic():
-            camera.position = target.center.numpy()
-            camera.up_direction = (-target.rotation[1]).numpy()
-            camera.look_at = (target.center + ahead * target.rotation[2]).numpy()
-        self.pacing.mark_changed(time.monotonic())
-
     def due(self) -> str | None:
         """Return the kind of picture that is due: "coarse", "sharp", or None."""
         with self._lock:
-            self._follow_path()
             return "sharp" if self._screenshot else self.pacing.due(time.monotonic())
 
     def draw(self, scenery: Scenery, kind: str) -> None:

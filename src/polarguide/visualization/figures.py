@@ -257,7 +257,7 @@ def scale_bar(low: float, high: float, colormap: str, unit: str = "", *, middle:
     """
     ramp = torch.linspace(low, high, 256).expand(22, -1)
     end = f"{high:g} {unit}".rstrip()
-    return _bar(scalar_to_rgb(ramp, low, high, colormap), f"{low:g}", middle, end)
+    return color_bar(scalar_to_rgb(ramp, low, high, colormap), f"{low:g}", middle, end)
 
 
 def angle_wheel(scale: float = 1.0) -> Picture:
@@ -335,10 +335,10 @@ def with_name(picture: Picture, name: str) -> Picture:
 
 def color_patch(color: int, text: str) -> Picture:
     """Draw a patch of a gray level (0 to 255) with a label below, uint8 RGB [44, 256, 3]."""
-    return _bar(np.full((22, 256, 3), color, np.uint8), text)
+    return color_bar(np.full((22, 256, 3), color, np.uint8), text)
 
 
-def _bar(colors: Picture, left: str, middle: str = "", right: str = "") -> Picture:
+def color_bar(colors: Picture, left: str, middle: str = "", right: str = "") -> Picture:
     """Draw colors [22, 256, 3] with labels below at the left, in the middle, and at the right."""
     image = Image.new("RGB", (256, 44), "white")
     image.paste(Image.fromarray(colors))

@@ -225,19 +225,17 @@ def resolve_field(
         **vars(settings),
         "steps": recipe.steps,
         "refractive_index": index_of(None, scene.refractive_index),
-        "views_per_step": 1,
         "gaussians": 0,
         **{name: recorded[name] for name in ("steps", "refractive_index") if name in recorded},
         **settings.specified(),
     }
     if values["background"] == "auto":
         values["background"] = "scene"
-    for name, most in (("gaussians", 0), ("views_per_step", 1)):
-        require(
-            values[name] <= most,
-            name,
-            expected=f"{most} with the recipe {recipe.name}, a field",
-            found=str(values[name]),
-            remedy="Omit this option.",
-        )
+    require(
+        values["gaussians"] == 0,
+        "gaussians",
+        expected=f"0 with the recipe {recipe.name}, a field",
+        found=str(values["gaussians"]),
+        remedy="Omit this option.",
+    )
     return ResolvedSettings(**values)

@@ -18,6 +18,7 @@ from polarguide.visualization.figures import (
     LINE_HEIGHT,
     Picture,
     aolp_to_rgb,
+    color_bar,
     contact_sheet,
     dolp_to_rgb,
 )
@@ -37,7 +38,6 @@ _WITHIN = (64, 200, 64)
 _BEYOND = (255, 32, 32)
 _DEFECT = (255, 224, 0)
 _NOT_COMPARED = 110
-_BAR = 256
 _CHARACTER = 9
 """Assumed width of a character in wrapped text, in pixels. Most texts are narrower."""
 Beyond = Sequence[tuple[Region, Sequence[str]]]
@@ -244,9 +244,5 @@ def diverging(values: Map, most: float) -> Picture:
 
 def _bar(most: float) -> Picture:
     """Draw the color scale, with its numbers below."""
-    bar: Picture = np.full((44, _BAR, 3), 255, np.uint8)
-    bar[:22] = diverging(np.linspace(-most, most, _BAR, dtype=np.float32)[None].repeat(22, axis=0), most)
-    for text, share in ((f"-{most:g}", 0.0), ("0", 0.5), (f"+{most:g}", 1.0)):
-        (width, _), _ = cv2.getTextSize(text, FONT, 0.5, 1)
-        cv2.putText(bar, text, (round(share * (_BAR - width)), 39), FONT, 0.5, INK, 1, cv2.LINE_AA)
-    return bar
+    ramp = np.linspace(-most, most, 256, dtype=np.float32)[None].repeat(22, axis=0)
+    return color_bar(diverging(ramp, most), f"-{most:g}", "0", f"+{most:g}")

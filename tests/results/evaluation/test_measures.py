@@ -161,6 +161,19 @@ def test_haze_is_the_mean_alpha_in_front_of_the_surface():
     assert score(VIEW, FACTS)["haze_free"] is None
 
 
+def test_haze_in_free_space_is_the_mean_over_pixels_with_a_confirmed_surface():
+    result, _, in_front = rendered(VIEW, 5)
+    confirmed = torch.zeros(HEIGHT, WIDTH, dtype=torch.bool)
+    confirmed[:, 3:9] = True
+    counted = [float(in_front[p]) for p in PIXELS if confirmed[p] and not VIEW.invalid[p]]
+    target = ViewTarget.of_view(VIEW, FACTS, CPU)
+    seen = torch.ones_like(confirmed)
+    scores = score_view(target.with_coverage(seen, confirmed), result, in_free_space=in_front)
+    assert scores["haze_free"] == pytest.approx(statistics.mean(counted))
+    nowhere = target.with_coverage(seen, torch.zeros_like(confirmed))
+    assert score_view(nowhere, result, in_free_space=in_front)["haze_free"] is None
+
+
 def test_depth_beyond_counts_what_is_drawn_from_behind_the_surface():
     result, *_ = rendered(VIEW, 5)
     true = VIEW.ground_truth.depth

@@ -267,13 +267,23 @@ def test_a_record_is_read_from_its_run(tmp_path, views):
     Fault("metrics.json (fps)", "finite").raised_by(record.read_metrics, tmp_path)
 
 
+def test_worst_views_have_the_lowest_psnr_and_the_most_haze(views):
+    haze = {"v1": 0.01, "v2": 0.03, "v3": None}
+    views["v3"] = views["v1"] | {"psnr": 11.0}
+    scored = {name: view | {"haze_free": haze[name]} for name, view in views.items()}
+    shown = dict(table.shown_metrics(scores.summarize(scored) | {"views": scored}))
+    assert shown["PSNR, worst view"] == "11.000 dB (v3)"
+    assert shown["haze, worst view"] == "3.000 % (v2)"
+    assert shown["haze"] == "2.000 %"
+
+
 def test_shown_metrics_are_those_of_the_tables(views):
     means = scores.summarize(views) | {"fps": 12.5, "gaussians": 1000, "normal_within_11": 0.25}
     means |= {"train_seconds_reason": "the log is gone", "depth_error_median_percent": None}
     lines = table.shown_metrics(means)
     hidden = table.absent_metrics(means)
     unseen = ["PSNR seen", "seen pixels", "SSIM seen", "Stokes error seen"]
-    assert hidden == [*unseen, "depth error", "mesh F-score 1 %"]
+    assert hidden == [*unseen, "depth error", "haze", "mesh F-score 1 %"]
     assert [label for label, _ in lines] == [
         m.label for m in table.METRICS if m.shown == "tables" and m.label not in hidden
     ]

@@ -374,10 +374,7 @@ def read_model(root: Path) -> ColmapModel:
         remedy="Triangulate points with the known poses (colmap point_triangulator).",
     )
     beyond = f"not finite, or farther than {FARTHEST:g}, and were ignored."
-    warnings = (
-        *second_model(folder, kind),
-        *([f"{dropped} of {dropped + len(points)} 3D points are {beyond}"] if dropped else []),
-    )
+    warnings = (f"{dropped} of {dropped + len(points)} 3D points are {beyond}",) if dropped else ()
     rows = {number: row for row, number in enumerate(numbers)}
     return ColmapModel(folder, files, points, colors, warnings, images, dict(model.cameras), tracks, rows)
 
@@ -481,13 +478,6 @@ def load_model(folder: Path, kind: str) -> Any:
             remedy="Export the model again; text files need two lines per image.",
         ) from error
     return model
-
-
-def second_model(folder: Path, kind: str) -> tuple[str, ...]:
-    """Return a warning if a folder has a text model next to the binary model that is used."""
-    if kind != ".bin" or not (folder / "images.txt").exists():
-        return ()
-    return (f"{folder} has two models. images.bin is used, and images.txt is ignored.",)
 
 
 @contextlib.contextmanager

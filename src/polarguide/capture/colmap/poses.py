@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import copy
 import functools
 from collections.abc import Mapping, Sequence
@@ -24,7 +23,6 @@ from polarguide.capture.colmap.model import (
     posed_images,
     posed_model,
     require_sound,
-    second_model,
 )
 from polarguide.capture.filter.develop import remapped_mask
 from polarguide.core.errors import PolarguideError, require
@@ -178,13 +176,11 @@ class Poses:
         assumed_sizes: views whose camera file states no size. Their cameras get the size of the pictures.
         held_out: held-out views that the pose files define.
         notes: notes for the user about the source of the poses.
-        warnings: warnings for the user about the source of the poses.
     """
 
     assumed_sizes: frozenset[str] = frozenset()
     held_out: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
-    warnings: tuple[str, ...] = ()
 
     def __init__(self, model: Any, where: Path, views: list[str], files: Sequence[Path] = ()) -> None:
         """Match the images of a model with views by stem.
@@ -237,10 +233,7 @@ class Poses:
         """
         folder, kind = find_model(path, points=False)
         files = [folder / (name + kind) for name in MODEL_FILES]
-        model = load_model(folder, kind)
-        poses = cls(model, folder, views, [file for file in files if file.exists()])
-        poses.warnings = second_model(folder, kind)
-        return poses
+        return cls(load_model(folder, kind), folder, views, [file for file in files if file.exists()])
 
     @classmethod
     def of_cameras(
@@ -249,22 +242,11 @@ class Poses:
         """Create poses without points from cameras by view name. ``where`` names their source in messages."""
         return cls(posed_model(cameras), where, views, files)
 
-    def others(self) -> list[tuple[Path, int]]:
-        """List the other models in the same folder, such as ``sparse/1``.
-
-        Returns:
-            The folder of each model, and the number of views for which it has a pose.
-        """
-        names = {*self.views, *self.missing}
-        counts = []
-        for folder in sorted(self.folder.parent.glob("[0-9]*")) if self.folder.name.isdigit() else []:
-            if folder != self.folder and any(
-                (folder / f"images{kind}").exists() for kind in (".bin", ".txt")
-            ):
-                with contextlib.suppress(PolarguideError):
-                    model = load_model(*find_model(folder, points=False))
-                    counts.append((folder, len(names & posed_images(model, names).keys())))
-        return [(folder, count) for folder, count in counts if count]
+    @property
+    def others(self) -> list[Path]:
+        """Folders of other models next to the folder of this model, such as ``sparse/1``."""
+        numbered = self.folder.parent.glob("[0-9]*") if self.folder.name.isdigit() else ()
+        return [folder for folder in sorted(numbered) if folder != self.folder]
 
     @property
     def points(self) -> int:

@@ -17,7 +17,6 @@ from polarguide.capture.write import write_png_file
 from polarguide.core.errors import require
 from polarguide.core.files import make_folder, write_text
 from polarguide.core.progress import Advance, Reporter
-from polarguide.geometry.polarizer import ANGLES
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 MOST_SHOTS = 12
@@ -51,20 +50,6 @@ def shots_of_one_place(paths: Sequence[Path]) -> int | None:
         if np.percentile(steps[between], 10) > _APART * np.percentile(steps[~between], 90):
             return size
     return None
-
-
-def numbered_like_angles(paths: Sequence[Path]) -> list[Path]:
-    """Return four pictures whose names differ only in one number, which is 0, 45, 90 or 135.
-
-    Examples are cup_P45.png, cup(45).png and 45_cup.png. The result is empty if there are no such pictures.
-    """
-    groups: dict[tuple[Path, str, str], dict[int, Path]] = {}
-    for path in paths:
-        for number in re.finditer(r"\d+", path.stem):
-            around = (path.parent, path.stem[: number.start()], path.stem[number.end() :])
-            groups.setdefault(around, {})[int(number[0])] = path
-    alike = (group for group in groups.values() if sorted(group) == list(ANGLES))
-    return list(next(alike, {}).values())
 
 
 def _edges(path: Path) -> NDArray[np.float32]:
