@@ -26,14 +26,7 @@ from polarguide.runs.health import METALS_PICTURE, report_metals
 from polarguide.runs.model import GaussianModel
 from polarguide.training.angles.fits import gaussian_training
 from polarguide.training.loop import TrainingLoop
-from polarguide.training.metals.observations import (
-    ViewSamples,
-    contradicted,
-    label_weights,
-    samples_of,
-    shares,
-    view_sums,
-)
+from polarguide.training.metals.observations import ViewSamples, contradicted, label_weights, shares
 from polarguide.training.metals.search import (
     GOLD,
     INFINITE,
@@ -46,12 +39,10 @@ from polarguide.training.metals.search import (
     decide,
     errors,
     evidence,
-    likelihood_ratio,
     looks,
     minimum_cut,
     surfaces,
     unary,
-    variance_prior,
     warn_of_unused_materials,
 )
 from polarguide.training.recipe import MetalRules, MetalViews
@@ -75,9 +66,7 @@ def test_errors_are_those_of_fresnels_equations(material: str) -> None:
     cosine = 0.35 + 0.6 * torch.rand(24, 40, generator=generator).double()
     light = 0.1 + torch.rand(24, 40, 1, generator=generator).double().expand(24, 40, 3)
     s0, across, _ = measured(material, cosine, light)
-    samples = ViewSamples(
-        torch.ones(24, 40).double(), s0, across, torch.zeros_like(s0), cosine, torch.zeros(24, 40)
-    )
+    samples = ViewSamples(torch.ones(24, 40).double(), s0, across, torch.zeros_like(s0), cosine)
     result = errors(samples, 1.5, 0.5, 0.02)
     if material in METALS:
         assert bool((result.metal < 0.2 * result.dielectric).all())
@@ -93,8 +82,7 @@ def test_oblique_polarization_excuses_whom_it_can_come_from(light: float, metal_
     cosine = torch.full((6, 1), 0.7).double()
     s0 = torch.full((6, 1, 3), 0.5).double()
     oblique = 0.1 * s0
-    samples = ViewSamples(torch.ones(6, 1).double(), s0, 0.1 * s0, oblique, cosine, torch.zeros(6, 1))
-    result = errors(samples, 1.5, light, 0.0)
+    result = errors(ViewSamples(torch.ones(6, 1).double(), s0, 0.1 * s0, oblique, cosine), 1.5, light, 0.0)
     assert float(result.metal) == 0  # the metal is off across the plane by less than what is at 45 degrees
     s, p = reflectances_from_cosine(cosine[0], 1.5)
     most = float((s * p).sqrt()) * light
@@ -107,8 +95,7 @@ def test_more_oblique_polarization_than_a_metal_keeps_is_an_error() -> None:
     cosine = torch.full((6, 1), math.cos(math.radians(70))).double()
     s0 = torch.full((6, 1, 3), 0.5).double()
     oblique = 0.95 * s0
-    samples = ViewSamples(torch.ones(6, 1).double(), s0, 0.1 * s0, oblique, cosine, torch.zeros(6, 1))
-    result = errors(samples, 1.5, 0.1, 0.0)
+    result = errors(ViewSamples(torch.ones(6, 1).double(), s0, 0.1 * s0, oblique, cosine), 1.5, 0.1, 0.0)
     index = optics.conductor_index(torch.tensor(LEVELS).double())
     largest = float(optics.conductor_oblique_share(cosine[0], *index).abs().max())
     assert largest < 0.9
@@ -139,67 +126,6 @@ def test_a_neighbor_of_a_metal_is_none(material: str, other: str, most: float) -
     x, _, z = ball_of_two["means"].unbind(1)
     assert float(metal[(z > 0.1) & (x > 0.1)].float().mean()) > 0.8
     assert float(metal[(z > 0.1) & (x < -0.1)].float().mean()) < most
-
-
-@pytest.mark.parametrize(("scale", "weight"), [(4e-4, 2.0), (1e-3, 6.0), (2e-4, 40.0)])
-def test_the_prior_of_error_variances_is_estimated_from_samples(scale: float, weight: float) -> None:
-    random = np.random.default_rng(3)
-    observations = random.integers(2, 30, 20_000)
-    variances = scale * weight / random.chisquare(weight, 20_000)
-    samples = variances * random.chisquare(observations) / observations
-    prior = variance_prior(torch.from_numpy(samples), torch.from_numpy(observations))
-    assert prior.scale == pytest.approx(scale, rel=0.05)
-    assert prior.weight == pytest.approx(weight, rel=0.15)
-
-
-def test_equal_variances_give_a_strong_prior() -> None:
-    random = np.random.default_rng(4)
-    samples = 1e-3 * random.chisquare(10, 5000) / 10
-    prior = variance_prior(torch.from_numpy(samples), torch.full((5000,), 10.0))
-    assert prior.weight > 200
-    assert prior.scale == pytest.approx(1e-3, rel=0.02)
-
-
-def test_large_errors_of_other_surfaces_do_not_hide_a_metal() -> None:
-    """Surfaces with wrong normals, with correct normals, and a metal with five views."""
-    dielectric = torch.tensor([1.4e-3] * 500 + [2e-4] * 300 + [1.5e-3])
-    metal = torch.tensor([2e-3] * 500 + [8e-4] * 300 + [2e-4])
-    ratio = likelihood_ratio(dielectric, metal, torch.full((801,), 5.0), torch.zeros(801))
-    assert float(ratio[-1]) > 2 * RULES.prior
-    assert float(ratio[:-1].max()) < 0
-
-
-def test_mixtures_of_normals_reduce_evidence_and_never_reverse_it() -> None:
-    """A small error of the metal is evidence in pure pixels only."""
-    others = torch.logspace(-4, -2, 100)
-    dielectric = torch.cat((torch.tensor([6e-4] * 3 + [1e-4] * 3), others))
-    metal = torch.cat((torch.tensor([1e-4] * 3 + [6e-4] * 3), others))
-    mixed = torch.cat((torch.tensor([0.0, 1e-3, 1.0] * 2), torch.zeros(100)))
-    ratio = likelihood_ratio(dielectric, metal, torch.full((106,), 5.0), mixed)
-    assert float(ratio[0]) > 2 * RULES.prior
-    assert 0 < float(ratio[1]) < RULES.prior
-    assert 0 < float(ratio[2]) < 1e-3
-    torch.testing.assert_close(ratio[3:6], -ratio[:3])
-
-
-def test_thin_objects_mix_normals() -> None:
-    """A ball is thin where it is as small as a pixel: its normals then point to all sides of a view."""
-    ball = gaussians_of_the_ball()
-    view = views_of("gray", 0.0)[0]
-    tiny = {name: values.clone() for name, values in ball.items()}
-    tiny["means"] *= 0.05
-    tiny["log_scales"] += math.log(0.05)
-    mixtures = []
-    for gaussians in (ball, tiny):
-        samples = samples_of(view_sums(gaussians, [view], rasterize_cpu, LIMITS), slice(None), LIMITS)
-        mixtures.append(float((samples.weight * samples.mixture).sum() / samples.weight.sum()))
-    assert mixtures[0] < 0.1
-    assert mixtures[1] > 3 * mixtures[0]
-
-
-def test_surfaces_in_too_few_views_give_no_evidence() -> None:
-    views = torch.tensor([0.0, 0.3, 0.0])
-    assert not bool(likelihood_ratio(torch.ones(3), 0.1 * torch.ones(3), views, torch.zeros(3)).any())
 
 
 def random_graph(count: int, seed: int) -> tuple[np.ndarray, Graph]:

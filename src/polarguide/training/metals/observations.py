@@ -37,8 +37,6 @@ class ViewSamples(NamedTuple):
         across: [V, N, 3] mean polarization P across the plane of incidence.
         oblique: [V, N, 3] mean polarization at 45 degrees to that plane.
         cosine: [V, N] mean cosine of the zenith angle.
-        mixture: [V, N] mean of ``1 - R^2`` with the length R of the blended normal. It is 0 in pixels with a single
-            normal, and 1 in pixels with all directions.
     """
 
     weight: Tensor
@@ -46,13 +44,12 @@ class ViewSamples(NamedTuple):
     across: Tensor
     oblique: Tensor
     cosine: Tensor
-    mixture: Tensor
 
 
 def view_sums(
     gaussians: Parameters, views: Iterable[View], rasterize: Rasterize, limits: MetalViews
 ) -> list[Tensor]:
-    """Return, for each view, sums [N, 12] over the pixels of each Gaussian.
+    """Return, for each view, sums [N, 11] over the pixels of each Gaussian.
 
     ``samples_of`` converts these sums to means. Every view has to determine the Stokes vector.
     """
@@ -75,10 +72,10 @@ def shares(gaussians: Parameters, camera: Camera, target: Tensor, rasterize: Ras
 
 
 def _look(gaussians: Parameters, view: View, rasterize: Rasterize, least_normal: float) -> Tensor:
-    """Return sums [N, 12] over the pixels of each Gaussian in a view.
+    """Return sums [N, 11] over the pixels of each Gaussian in a view.
 
-    The columns are 1, S0 (three colors), P (three), the polarization at 45 degrees (three), the cosine of the zenith,
-    and the mixture of normals.
+    The columns are 1, S0 (three colors), P (three), the polarization at 45 degrees (three), and the cosine of the
+    zenith.
     """
     device = gaussians["means"].device
     normal = render(gaussians, view.camera, rasterize, RenderRequest(sh_degree=0)).normal
@@ -96,9 +93,7 @@ def _look(gaussians: Parameters, view: View, rasterize: Rasterize, least_normal:
     oblique = s2 * cosine2 - s1 * sine
     one = torch.ones_like(x)[..., None]
     good = (reliable & ~(view.invalid | view.saturated))[..., None]
-    cosine = -dot(guide, rays)[..., None]
-    mixture = (1 - dot(normal, normal))[..., None].clamp(min=0)
-    target = torch.cat((one, s0, across, oblique, cosine, mixture), dim=-1) * good
+    target = torch.cat((one, s0, across, oblique, -dot(guide, rays)[..., None]), dim=-1) * good
     return shares(gaussians, view.camera, target.contiguous(), rasterize)
 
 
@@ -110,9 +105,7 @@ def samples_of(looks: Sequence[Tensor], which: slice, limits: MetalViews) -> Vie
     cosine = means[..., 9].clamp(0, 1)
     counts = weight > limits.least_share * weight.amax(dim=0)
     counts &= (cosine > limits.cosines[0]) & (cosine < limits.cosines[1])
-    return ViewSamples(
-        weight * counts, means[..., :3], means[..., 3:6], means[..., 6:9], cosine, means[..., 10]
-    )
+    return ViewSamples(weight * counts, means[..., :3], means[..., 3:6], means[..., 6:9], cosine)
 
 
 @torch.no_grad()

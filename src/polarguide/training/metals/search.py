@@ -20,15 +20,9 @@ Unpolarized light has no U. Polarized light changes P about as much as U. A meta
 A dielectric preserves at most ``sqrt(Rs Rp)`` times the light of the scene. Under each hypothesis, the explained part
 of U reduces the error in P, and the rest of U is added as an error.
 
-The errors E are mean squares of d = 2 n observations relative to the light: P and U in n views. Their variance differs
-between surfaces, because it includes the errors of the rendered normals. Its prior is a scaled inverse chi-square
-distribution with scale ``s^2`` and weight ``d0``, both estimated from all surfaces of the scene (``variance_prior``).
-With the variance integrated out, the log likelihood ratio is ``(d0 + d)/2 log((d0 s^2 + d E_dielectric) / (d0 s^2 + d
-E_metal))`` (Smyth 2004, "Linear models and empirical Bayes methods", Statistical Applications in Genetics 3).
-
-Pixels of thin objects blend normals of different directions. Neither hypothesis predicts their polarization, so that a
-small error is no evidence there. Both errors get the additional variance ``MIXED m^4``, where ``m = 1 - R^2`` is the
-mixture of normals in pixels with blended normals of length R.
+The errors E are mean squares relative to the light, over n views of unknown variance. With e the typical error of the
+scene, a lower bound of all errors, the log likelihood ratio is ``n log((e^2 + E_dielectric) / (e^2 + E_metal))``. P and
+U contribute n/2 each.
 """
 
 from __future__ import annotations
@@ -42,11 +36,9 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.optimize import brentq
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import breadth_first_order, connected_components, maximum_flow
 from scipy.spatial import cKDTree
-from scipy.special import digamma, polygamma
 from torch import Tensor
 
 from polarguide import optics
@@ -88,9 +80,7 @@ GOLD = 0.38
 UNKNOWNS = 2
 """Number of unknowns of each hypothesis. As many views are needed to determine the unknowns, and give no evidence."""
 NOISE = 1e-4
-"""Mean square of the noise of a camera relative to the light. Smaller errors count as this error in the prior."""
-MIXED = 0.05
-"""Error variance of the degree of polarization in a pixel that blends normals of all directions."""
+"""Lower bound of the typical error of a scene, which is the mean square of the noise relative to the light."""
 CHUNK = 1 << 14
 """Batch size in Gaussians, which bounds the memory of intermediate tensors."""
 
@@ -217,71 +207,14 @@ def of_views(
         total = samples.weight.sum(dim=0)
         count = total * total / (samples.weight**2).sum(dim=0).clamp(min=1e-9) * (total > LEAST_PIXELS)
         color = (samples.weight[..., None] * samples.s0).sum(dim=0) / total.clamp(min=1e-6)[:, None]
-        mixture = (samples.weight * samples.mixture).sum(dim=0) / total.clamp(min=1e-6)
-        parts.append((*errors(samples, refractive_index, light, limits.dark), count, color, total, mixture))
-    dielectric, metal, reflectance, count, color, total, mixture = (
+        parts.append((*errors(samples, refractive_index, light, limits.dark), count, color, total))
+    dielectric, metal, reflectance, count, color, total = (
         torch.cat(values) for values in zip(*parts, strict=True)
     )
-    views = (count - UNKNOWNS).clamp(min=0)
-    mixed = MIXED * mixture**4
-    ratio = likelihood_ratio(dielectric, metal, views, mixed) - _tint_cost(color, total, rules)
-    return MetalEvidence(ratio, views, reflectance, color.clamp(min=0), labels)
-
-
-def likelihood_ratio(dielectric: Tensor, metal: Tensor, views: Tensor, mixed: Tensor) -> Tensor:
-    """Return the log likelihood ratio [N] of metal and dielectric, per view.
-
-    It is 0 in scenes without a surface that has at least one independent view.
-
-    Args:
-        dielectric, metal: [N] errors of the two hypotheses.
-        views: [N] number of independent views, beyond those that determine the unknowns.
-        mixed: [N] additional variance of pixels that blend different normals.
-    """
-    sampled = views >= 1
-    if not bool(sampled.any()):
-        return torch.zeros_like(views)
-    observations = 2 * views.clamp(min=1e-6)
-    smaller = torch.minimum(dielectric, metal).clamp(min=NOISE)
-    prior = variance_prior(smaller[sampled], observations[sampled])
-    squares = prior.weight * prior.scale + observations * mixed
-    sums = [squares + observations * error for error in (dielectric, metal)]
-    return (prior.weight / observations + 1) * (sums[0] / sums[1]).log()
-
-
-class VariancePrior(NamedTuple):
-    """Scaled inverse chi-square distribution of the error variances of the surfaces of a scene.
-
-    Attributes:
-        scale: typical variance.
-        weight: degrees of freedom, as the number of observations that the prior is worth. It is small if the variances
-            of surfaces differ much.
-    """
-
-    scale: float
-    weight: float
-
-
-LEAST_SPREAD = 1e-3
-"""Least variance of the logarithms of error variances. It limits the weight of the prior to 2,000 observations."""
-
-
-def variance_prior(errors: Tensor, observations: Tensor) -> VariancePrior:
-    """Estimate the prior of the error variance from the logarithms of all errors.
-
-    The mean and the variance of the logarithms determine both parameters (Smyth 2004, Sec. 6.2).
-
-    Args:
-        errors: [N] mean squared errors, above 0.
-        observations: [N] number of observations of each error, at least 2.
-    """
-    half = 0.5 * observations.double().cpu().numpy()
-    logarithms = errors.double().cpu().numpy()
-    logarithms = np.log(logarithms) - digamma(half) + np.log(half)
-    spread = max(float(logarithms.var() - polygamma(1, half).mean()), LEAST_SPREAD)
-    weight = 2 * brentq(lambda value: polygamma(1, value) - spread, 1e-6, 1e6)
-    scale = math.exp(float(logarithms.mean()) + digamma(weight / 2) - math.log(weight / 2))
-    return VariancePrior(scale, weight)
+    typical = torch.minimum(dielectric, metal)[count > UNKNOWNS]
+    error = typical.median().clamp(min=NOISE) if len(typical) else dielectric.new_tensor(1.0)
+    ratio = ((error + dielectric) / (error + metal)).log() - _tint_cost(color, total, rules)
+    return MetalEvidence(ratio, (count - UNKNOWNS).clamp(min=0), reflectance, color.clamp(min=0), labels)
 
 
 def _tint_cost(color: Tensor, weight: Tensor, rules: MetalRules) -> Tensor:
