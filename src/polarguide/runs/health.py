@@ -14,6 +14,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
+from types import MappingProxyType
 from typing import Annotated, Literal
 
 import msgspec
@@ -320,9 +321,8 @@ def examine(
                 model, view, result, LIMITS.brighter * brightest, evidence.filters
             )
             radii.append(result.training["radii"])
-            depths.append(
-                depth_map_of_rendering(view.camera, result.depth, result.alpha, center, reach).on_grid()
-            )
+            alpha = result.alpha.cpu() * ~view.invalid.cpu()
+            depths.append(depth_map_of_rendering(view.camera, result.depth, alpha, center, reach).on_grid())
             advance(len(by_view))
     cameras = {**{view.name: view.camera for view in views}, **evidence.held_out}
     for name, psnr in _neighbor_psnr(views, {name: facts.psnr for name, facts in by_view.items()}).items():
@@ -330,20 +330,25 @@ def examine(
     unseen = None
     if len(views) == min(MOST_VIEWS, len(evidence.views)):  # a part of the views would miss visible Gaussians
         unseen = float((torch.stack(radii).amax(dim=0) <= 0).float().mean())
-    haze = haze_of_views(model, cameras, ConfirmedSurfaces(depths))
+    invalid = {view.name: view.invalid.cpu() for view in views}
+    haze = haze_of_views(model, cameras, ConfirmedSurfaces(depths), invalid)
     warnings = tuple(warnings_of(by_view, unseen, haze))
     return Health(evidence.polarization, warnings, by_view, haze, brightest, unseen)
 
 
 def haze_of_views(
-    model: GaussianModel, cameras: Mapping[str, Camera], surfaces: ConfirmedSurfaces
+    model: GaussianModel,
+    cameras: Mapping[str, Camera],
+    surfaces: ConfirmedSurfaces,
+    invalid: Mapping[str, Tensor] = MappingProxyType({}),
 ) -> dict[str, float]:
-    """Return the mean alpha in free space of each view, over pixels with a confirmed surface.
+    """Return the mean alpha in free space of each view, over valid pixels with a confirmed surface.
 
     Args:
         model: the trained model.
         cameras: cameras of the views by name.
         surfaces: surfaces that training views confirm.
+        invalid: masks [H, W] of invalid pixels by name. Other views have none.
 
     Returns:
         Alpha in [0, 1] by name. Views without a confirmed surface are missing.
@@ -352,6 +357,8 @@ def haze_of_views(
     for name, camera in cameras.items():
         nearest = surfaces.nearest(camera)
         confirmed = nearest > 0
+        if name in invalid:
+            confirmed &= ~invalid[name]
         if bool(confirmed.any()):
             alpha = model.alpha_in_front(camera, HAZE_DEPTH * nearest).cpu()
             haze[name] = float(alpha[confirmed].mean())

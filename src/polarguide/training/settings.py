@@ -84,8 +84,8 @@ class ResolvedSettings:
     steps: int
     seed: int = 0
     refractive_index: float
-    views_per_step: Literal[1] = 1
-    """Earlier versions could train on several views per step."""
+    views_per_step: int = 1
+    """Earlier versions could train on several views per step. Such a run opens, but does not resume."""
     background: Background = "auto"
     gaussians: int = 0
     exposures: Exposures = "captured"
