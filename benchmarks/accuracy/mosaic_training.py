@@ -7,7 +7,7 @@ Each training picture of a scene with four angles becomes a raw mosaic with sens
   interpolation then cancel. Layers are sampled and interpolated as well. Targets of normals do not change.
 - ``complete``: four complete pictures with the same noise. No sensor measures them; they are an upper bound.
 
-    python benchmarks/accuracy/mosaic_training.py SCENE OUT --kind matched [--sensor IMX250MYR] [--downscale 2]
+    python benchmarks/accuracy/mosaic_training.py SCENE OUT --kind matched [--downscale 2]
 
 Held-out views are exact. Scores are printed for pixels within two pixels of an edge of object, depth or normal, and for
 all other pixels. Materials are dielectric, because the search for metals fails on mosaics this small.
@@ -160,7 +160,7 @@ def simulated(view: View, number: int, kind: str, sensor: str) -> View:
     raw = mosaic(view.stokes().double().numpy(), sensor, 1.0, random, IDEAL)
     top = (1 << IDEAL.bits) - 1
     values = (raw.astype(np.float32) - IDEAL.black) / (top - IDEAL.black)
-    picture = demosaic(values, raw >= top, sensor_pattern(sensor), mode="full", interpolation="bilinear")
+    picture = demosaic(values, raw >= top, sensor_pattern(sensor), mode="full")
     invalid = view.invalid | torch.from_numpy(picture.invalid)
     return replace(view, pictures=codes(picture.intensities), invalid=invalid)
 

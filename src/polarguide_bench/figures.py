@@ -149,8 +149,9 @@ def training_curves(curves: Mapping[str, pd.DataFrame]) -> str:
         panels = figure.subplots(1, 2, sharey=True)
         for axes, column, label in zip(panels, ("step", "seconds"), ("steps", "seconds"), strict=True):
             for number, (recipe, curve) in enumerate(curves.items()):
-                color = f"C{number}"
-                axes.plot(curve[column], curve["psnr"], color=color, linewidth=1, label=recipe)
+                color = f"C{number % 10}"
+                dashes = ("-", "--", ":")[number // 10 % 3]
+                axes.plot(curve[column], curve["psnr"], dashes, color=color, linewidth=1, label=recipe)
                 axes.plot(curve[column], curve["held_out"], "o", color=color, markersize=3)
             axes.set_xlabel(label)
             axes.spines[["top", "right"]].set_visible(False)

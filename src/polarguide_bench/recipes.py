@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+from polarguide.core.errors import require
 from polarguide.methods import registry
 from polarguide.methods.baselines import RECIPE_3DGS, RECIPE_3DGS_DR
 from polarguide.methods.polarguide import (
@@ -312,9 +313,18 @@ def recipe_named(name: str) -> AnyRecipe:
     """Return a recipe or an ablation by name.
 
     Raises:
-        PolarguideError: see ``polarguide.methods.recipe_named``.
+        PolarguideError: the name is unknown, see ``polarguide.methods.recipe_named``.
     """
-    return FIELDS[name] if name in FIELDS else registry.recipe_named(name)
+    if name in FIELDS:
+        return FIELDS[name]
+    require(
+        not name.startswith("gnerp:"),
+        "recipe",
+        expected=f"a recipe of this version: {', '.join(sorted(FIELDS))}",
+        found=name,
+        remedy="Name one of these recipes.",
+    )
+    return registry.recipe_named(name)
 
 
 def ablations_of(name: str) -> tuple[AnyRecipe, ...]:

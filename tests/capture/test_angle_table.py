@@ -15,7 +15,7 @@ from faults import Fault
 
 from polarguide.capture import load_scene
 from polarguide.capture.calibration import Calibration, combined, oriented
-from polarguide.capture.exposures import FOUR, Exposure, read_table, table_text
+from polarguide.capture.exposures import FOUR, Exposure, angles_of_names, read_table, table_text
 from polarguide.capture.filter.shots import find_single_shots
 from polarguide.capture.point_exposures import PointExposures, exposures_of_points
 from polarguide.geometry.polarizer import ANGLES, malus, stokes_of_four
@@ -384,3 +384,18 @@ def test_what_one_source_lacks_the_other_gives() -> None:
     assert np.isnan(found[7])
     known = np.arange(9) != 7
     np.testing.assert_allclose((found - found[0])[known], (logs - logs[0])[known], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("names", "view"),
+    [
+        (("v0_I_000", "v0_I_045", "v0_I_090", "v0_I_135"), "v0"),
+        (("v0_I_000", "v0_I_060", "v0_I_120"), "v0"),
+        (("v0_I_000", "v0_I_045", "v0_I_unknown"), "v0"),
+        (("v0_pol_010", "v0_pol_070", "v0_pol_130"), "v0"),
+        (("I_000", "I_060", "I_120"), "I"),
+    ],
+)
+def test_a_letter_before_the_angle_is_no_part_of_the_view(names: tuple[str, ...], view: str) -> None:
+    read = angles_of_names(names)
+    assert all(name is not None and name[0] == view for name in read)

@@ -118,6 +118,15 @@ def test_cameras_without_a_focal_length_are_refused(tmp_path: Path) -> None:
     Fault("image a.png").raised_by(Poses.read, tmp_path, ["a"])
 
 
+def test_a_text_model_beside_the_binary_one_is_told(capture: TinyCapture) -> None:
+    to_binary(capture)
+    assert read_model(capture.root).warnings == ()
+    folder = model_folder(capture)
+    pycolmap.Reconstruction(str(folder)).write_text(str(folder))
+    (warning,) = read_model(capture.root).warnings
+    assert warning == f"{folder} has two models. images.bin is used, and images.txt is ignored."
+
+
 @pytest.mark.parametrize(("name", "old", "new"), [("cameras", ".5", ",5"), ("images", "0.", "0,")])
 def test_decimal_commas_of_a_model_are_named(capture: TinyCapture, name: str, old: str, new: str) -> None:
     path = model_folder(capture) / f"{name}.txt"

@@ -91,9 +91,15 @@ CASES += table(
 )  # fmt: skip
 
 
+def _color(value: str) -> Change:
+    return edit(POINTS, lambda given: given.replace("10 20 30", f"{value} 20 30"))
+
+
 BEHIND = "".join(f"{n} {n} {-n} -900 1 2 3 0.5\n" for n in range(1, 30))
 CASES += table(
     "points3D.txt", TRAIN,
+    Case("of a color of 256", _color("256"), found="256, 20, 30", ci=True),
+    Case("of a color of -1", _color("-1"), found="-1, 20, 30", ci=True),
     Case("of points behind the cameras", write(POINTS, BEHIND), prints="None of the 29 points", ci=True),
 )  # fmt: skip
 

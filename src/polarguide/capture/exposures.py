@@ -367,11 +367,14 @@ _WORDS = "unknown|none"
 _NUMBER = r"(?P<mark>angle|pol|a|i)?[-_ ]?(?P<angle>\d{1,3}(?:\.\d+)?)(?P<unit>deg)?"
 # A hyphen before a number is a minus only after another separator: cup_-45 means -45, cup-45 means 45.
 _APART = r"(?:[-_ .]*[_ .](?P<minus>-)(?=\d)|[-_ .]+)"
-_SINGLE = re.compile(rf"(?P<view>.+?){_APART}(?:{_NUMBER}|(?P<word>{_WORDS}))", re.IGNORECASE)
+_MARK = r"(?:(?:angle|pol|a|i)[-_ ]?)?"
+_SINGLE = re.compile(rf"(?P<view>.+?){_APART}(?:{_NUMBER}|{_MARK}(?P<word>{_WORDS}))", re.IGNORECASE)
 # Degrees between the marks on the ring of a filter. A number that is no multiple of it may count pictures, so it is an
 # angle only with a letter or a unit.
 _MARKS = 15
-_NUMBERED = re.compile(rf"(?:(?P<view>.+?){_APART}|(?P<alone>-))?(?P<number>\d{{1,3}}(?:\.\d+)?)")
+_NUMBERED = re.compile(
+    rf"(?:(?P<view>.+?){_APART}{_MARK}|(?P<alone>-))?(?P<number>\d{{1,3}}(?:\.\d+)?)", re.IGNORECASE
+)
 _SMALLEST_STEP = 2.0
 """Smallest step of evenly spaced angles in degrees. Numbers with a smaller step may count pictures."""
 _ALIKE = 1e-6

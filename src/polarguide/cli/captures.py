@@ -44,7 +44,7 @@ def prepare_capture(
         say(f"next: {command('inspect', prepared.folder)}")
         say(f"then: {command('train', prepared.folder, '--out', f'runs/{prepared.folder.name}')}")
     else:
-        say("it has no poses: repeat the command with --poses sfm or --poses PATH")
+        say("it has no poses: repeat the command with --poses sfm or --poses PATH and another --out")
         say(
             f"each view alone: {command('priors', prepared.folder, '--out', f'{prepared.folder.name}-priors')}"
         )

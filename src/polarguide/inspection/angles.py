@@ -87,7 +87,10 @@ class AngleFindings:
         if whole is None:
             return "Repeat prepare without --order, --sense and --zero and with a new --out, and inspect the result."
         if self.applied is None:
-            return f"Write a corrected scene: polarguide prepare PICTURES --out NEW --poses SCENE {whole.options()}."
+            return (
+                f"Write a corrected scene: polarguide prepare SCENE/polar --out NEW --poses SCENE {whole.options()}. "
+                "Then copy split.json, gt and the entries polarizer, objects, materials and refractive_index of scene.json."
+            )
         return (
             f"Repeat prepare with {whole.options()} and a new --out. This is the complete calibration; the scene was "
             f"prepared with {applied.options()}."
@@ -165,7 +168,9 @@ def combine_evidence(
 
 def angle_checks(angles: AngleFindings) -> list[Check]:
     """Check the order, the direction and the zero of the angles."""
-    more = "Prepare the scene with poses (polarguide prepare ... --poses sfm) and inspect it again."
+    more = (
+        "Prepare with poses into a new folder (polarguide prepare ... --poses sfm --out NEW), and inspect it."
+    )
     if angles.sources:
         more = (
             "Take views from more directions, including rolled or slanted ones, of curved glossy dielectrics; or train "

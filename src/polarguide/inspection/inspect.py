@@ -193,7 +193,7 @@ def _fundamental(first: Camera, second: Camera) -> NDArray[np.float64]:
 def pose_check(capture: Capture) -> Check:
     """Check that feature matches between views agree with the poses."""
     if capture.model is None:
-        remedy = "Run polarguide prepare with --poses sfm or --poses PATH."
+        remedy = "Run polarguide prepare with --poses sfm or --poses PATH and a new --out."
         return Check("poses", "n/a", "There are no poses.", remedy)
     missing = tuple(view.name for view in capture.views if view.camera is None)
     errors = view_errors(epipolar_errors(capture))

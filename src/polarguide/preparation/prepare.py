@@ -124,6 +124,14 @@ class SceneFolder:
             found=f"a {path.name} of another origin",
             remedy=REMEDY,
         )
+        files = content["prepare"].get("request", {}).get("file", {})
+        require(
+            all(isinstance(digest, str) for digest in files.values()),
+            path,
+            expected="a preparation by this version",
+            found="one by an earlier version",
+            remedy="The scene still opens. To prepare again, choose another --out. Nothing was written.",
+        )
         journal: Journal[Any] = decode(content, Journal[measured_type], path, remedy=REMEDY)  # type: ignore[valid-type]
         before = journal.prepare
         if before.request.format == "singles":

@@ -103,7 +103,7 @@ _LONGEST_NAME = 4096
 def check_model_files(folder: Path, kind: str) -> None:
     """Check the files of a model before pycolmap reads them. Missing files are skipped.
 
-    pycolmap checks text files itself, except for decimal commas.
+    pycolmap checks text files itself, except for decimal commas and the range of colors.
 
     Args:
         folder: folder of the model.
@@ -139,6 +139,8 @@ def check_model_files(folder: Path, kind: str) -> None:
                 found=comma,
                 remedy="Write the model again with a locale that uses decimal points (LC_NUMERIC=C).",
             )
+        elif name == "points3D":
+            found = _invalid_color(data)
         if found is not None:
             raise PolarguideError(
                 path,
@@ -159,6 +161,21 @@ def _decimal_comma(data: bytes) -> str:
         if comma:
             return f"a decimal comma, {comma} in line {number}"
     return ""
+
+
+def _invalid_color(data: bytes) -> str | None:
+    """Describe the first color in ``points3D.txt`` that is not in the range 0 to 255. Return None if all are valid.
+
+    pycolmap reads such a color modulo 256 without an error.
+    """
+    for number, line in enumerate(data.splitlines(), 1):
+        cells = line.split(None, 7)[4:7]
+        if line[:1] != b"#" and any(
+            cell.lstrip(b"-").isdigit() and not (len(cell) <= 3 and 0 <= int(cell) <= 255) for cell in cells
+        ):
+            color = ", ".join(cell.decode("ascii", "replace")[:20] for cell in cells)
+            return f"a color of {color} in line {number}, outside of 0 to 255"
+    return None
 
 
 def _cameras(data: bytes) -> int:
@@ -374,7 +391,10 @@ def read_model(root: Path) -> ColmapModel:
         remedy="Triangulate points with the known poses (colmap point_triangulator).",
     )
     beyond = f"not finite, or farther than {FARTHEST:g}, and were ignored."
-    warnings = (f"{dropped} of {dropped + len(points)} 3D points are {beyond}",) if dropped else ()
+    warnings = (
+        *second_model(folder, kind),
+        *([f"{dropped} of {dropped + len(points)} 3D points are {beyond}"] if dropped else []),
+    )
     rows = {number: row for row, number in enumerate(numbers)}
     return ColmapModel(folder, files, points, colors, warnings, images, dict(model.cameras), tracks, rows)
 
@@ -478,6 +498,13 @@ def load_model(folder: Path, kind: str) -> Any:
             remedy="Export the model again; text files need two lines per image.",
         ) from error
     return model
+
+
+def second_model(folder: Path, kind: str) -> tuple[str, ...]:
+    """Return a warning if a folder has a text model next to the binary model that is used."""
+    if kind != ".bin" or not (folder / "images.txt").exists():
+        return ()
+    return (f"{folder} has two models. images.bin is used, and images.txt is ignored.",)
 
 
 @contextlib.contextmanager

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import functools
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,9 +24,10 @@ from polarguide.capture.colmap.model import (
     posed_images,
     posed_model,
     require_sound,
+    second_model,
 )
 from polarguide.capture.filter.develop import remapped_mask
-from polarguide.core.errors import PolarguideError, require
+from polarguide.core.errors import PolarguideError, PolarguideWarning, require
 from polarguide.core.text import listed
 
 
@@ -232,6 +234,8 @@ class Poses:
             PolarguideError: no model can be read, or it does not match the views.
         """
         folder, kind = find_model(path, points=False)
+        for warning in second_model(folder, kind):
+            warnings.warn(warning, PolarguideWarning, stacklevel=2)
         files = [folder / (name + kind) for name in MODEL_FILES]
         return cls(load_model(folder, kind), folder, views, [file for file in files if file.exists()])
 
@@ -246,7 +250,8 @@ class Poses:
     def others(self) -> list[Path]:
         """Folders of other models next to the folder of this model, such as ``sparse/1``."""
         numbered = self.folder.parent.glob("[0-9]*") if self.folder.name.isdigit() else ()
-        return [folder for folder in sorted(numbered) if folder != self.folder]
+        models = (folder for folder in numbered if any(folder.glob("images.*")))
+        return [folder for folder in sorted(models) if folder != self.folder]
 
     @property
     def points(self) -> int:

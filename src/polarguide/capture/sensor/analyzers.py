@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
-from polarguide.capture.sensor.pattern import Pattern, sensor_pattern
+from polarguide.capture.sensor.pattern import SENSORS, Pattern, sensor_pattern
 from polarguide.core.errors import PolarguideError, require
 from polarguide.core.files import in_utf8, require_file, write_whole
 from polarguide.core.records import decode
@@ -327,6 +327,8 @@ def _region(offset: tuple[int, int], size: tuple[int, int]) -> str:
 FORMAT = "polarguide-analyzers"
 VERSION = 1
 SUFFIX = ".safetensors"
+MOST_THROUGHPUT = 1e3
+"""Largest ratio of a throughput to 1, and of 1 to a throughput, that is accepted."""
 _LONGEST_HEADER = 100_000_000  # limit of safetensors in bytes; text gives a larger number
 _ENTRY = "polarguide"
 _TENSOR = "vectors"
@@ -419,10 +421,40 @@ def read_analyzers(path: Path) -> AnalyzerCalibration:
         found="other content: the file is damaged or was changed",
         remedy=_REMEDY,
     )
-    return AnalyzerCalibration(
+    calibration = AnalyzerCalibration(
         metadata.sensor, metadata.lens, (metadata.offset_x, metadata.offset_y), (metadata.width, metadata.height),
         metadata.block, vectors, metadata.reference, metadata.polarizer_extinction, metadata.sha256,
     )  # fmt: skip
+    fault = _fault(calibration)
+    if fault:
+        raise _damaged(path, fault)
+    return calibration
+
+
+def _fault(calibration: AnalyzerCalibration) -> str:
+    """Return the fault of a calibration whose checksum is valid; empty without a fault."""
+    vectors = calibration.vectors
+    if calibration.sensor not in SENSORS:
+        return f"the unknown sensor {calibration.sensor!r}"
+    period = calibration.pattern.period
+    shape = (*grid_shape(calibration.offset, calibration.size, calibration.block), period, period, 3)
+    if calibration.block % period or vectors.shape != shape or vectors.dtype != np.float32:
+        return f"vectors {list(vectors.shape)} of {vectors.dtype} instead of {list(shape)}"
+    gain = vectors[..., 0]
+    if not (
+        np.isfinite(vectors).all() and gain.min() >= 1 / MOST_THROUGHPUT and gain.max() <= MOST_THROUGHPUT
+    ):
+        return f"throughputs of {gain.min():g} to {gain.max():g} instead of a mean of 1/2"
+    if (np.hypot(vectors[..., 1], vectors[..., 2]) < LEAST_DIATTENUATION * gain).any():
+        return "vectors of pixels that hardly polarize"
+    angles = np.arctan2(vectors[..., 2], vectors[..., 1])
+    apart = np.cos(angles - 2 * np.radians(calibration.pattern.angles))
+    # Equal angles would not determine the light.
+    return (
+        "vectors of polarizers far from the sensor's angles"
+        if apart.min() < np.cos(2 * FARTHEST_ANGLE)
+        else ""
+    )
 
 
 def _damaged(path: Path, found: str) -> PolarguideError:
