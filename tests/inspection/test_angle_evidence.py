@@ -183,5 +183,5 @@ def test_a_scene_of_another_origin_gets_a_command(ball_views) -> None:
     views = tuple(mistaken(view, files=ORDERS[4].files()) for view in ball_views)
     evidence, _ = point_evidence(views, model_of(views), INDEX)
     remedy = order_check(combine_evidence([evidence], 0)).remedy
-    command = "polarguide prepare PICTURES --out NEW --poses SCENE --order 0,45,90,135 --sense cw --zero 0"
-    assert remedy == f"Write a corrected scene: {command}."
+    command = "polarguide prepare SCENE/polar --out NEW --poses SCENE --order 0,45,90,135 --sense cw --zero 0"
+    assert remedy.startswith(f"Write a corrected scene: {command}. Then copy split.json")

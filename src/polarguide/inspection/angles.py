@@ -89,7 +89,8 @@ class AngleFindings:
         if self.applied is None:
             return (
                 f"Write a corrected scene: polarguide prepare SCENE/polar --out NEW --poses SCENE {whole.options()}. "
-                "Then copy split.json, gt and the entries polarizer, objects, materials and refractive_index of scene.json."
+                "Then copy split.json, gt and the entries polarizer, objects, materials and refractive_index of "
+                "scene.json."
             )
         return (
             f"Repeat prepare with {whole.options()} and a new --out. This is the complete calibration; the scene was "
