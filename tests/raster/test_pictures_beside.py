@@ -1,6 +1,7 @@
 """The picture of a surface, held channels, and the weight in front of a depth: native against the reference."""
 
 import math
+
 import pytest
 import torch
 from faults import Fault

@@ -169,9 +169,7 @@ def combine_evidence(
 
 def angle_checks(angles: AngleFindings) -> list[Check]:
     """Check the order, the direction and the zero of the angles."""
-    more = (
-        "Prepare with poses into a new folder (polarguide prepare ... --poses sfm --out NEW), and inspect it."
-    )
+    more = "Prepare the scene with poses into a new folder (polarguide prepare ... --poses sfm --out NEW)."
     if angles.sources:
         more = (
             "Take views from more directions, including rolled or slanted ones, of curved glossy dielectrics; or train "
