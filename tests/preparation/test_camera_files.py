@@ -353,7 +353,7 @@ def test_profiles_state_how_a_picture_is_encoded(tmp_path, suffix, curve, expone
     path = tmp_path / f"v{suffix}"
     Image.new("RGB", (16, 16), (90, 120, 60)).save(path, **({} if curve is None else {"icc_profile": curve}))
     found = stated_encoding(path.read_bytes())
-    assert (found and found.exponent) == (None if exponent is None else pytest.approx(exponent, abs=0.02))
+    assert (found and found.exponent) == (None if exponent is None else pytest.approx(exponent, abs=0.01))
     if exponent == 1.8:
         Fault(str(path), found="1.80").raised_by(stated_transfer, [path])
     else:

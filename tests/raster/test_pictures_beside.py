@@ -1,7 +1,5 @@
 """The picture of a surface, held channels, and the weight in front of a depth: native against the reference."""
 
-import math
-
 import pytest
 import torch
 from faults import Fault
@@ -181,9 +179,8 @@ def test_alpha_in_front_is_that_of_the_near_gaussians_alone(splats: Splats) -> N
     for point, place in zip(splats.means.double(), places, strict=True):
         x, y, z = ((point - BEFORE.center) @ BEFORE.rotation.T).tolist()
         column, row = BEFORE.fx * x / z + BEFORE.cx, BEFORE.fy * y / z + BEFORE.cy
-        column = min(max(math.floor(column), 0), BEFORE.width - 1)
-        row = min(max(math.floor(row), 0), BEFORE.height - 1)
-        near.append(0 < float(place) < float(depth[row, column]))
+        inside = 0 <= column < BEFORE.width and 0 <= row < BEFORE.height
+        near.append(inside and float(place) < float(depth[int(row), int(column)]))
     assert 10 < sum(near) < len(near) - 10
     expected = rasterize_reference(Splats(*(t[torch.tensor(near)] for t in splats)), BEFORE).alpha
     got = alpha_in_front(splats, BEFORE, depth, rasterize_cpu)

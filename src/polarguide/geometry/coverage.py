@@ -119,7 +119,7 @@ class ConfirmedSurfaces:
     """Surfaces at which at least two training views have the same depth.
 
     Space in front of such a surface is free, because light passes through it into the views. A surface that only one
-    view shows, and that no other view contradicts, may stand in front. Space behind it is not known to be free.
+    view shows is not confirmed. It counts as haze if it stands in front of a confirmed surface.
 
     Args:
         training: depth maps of the training views, in any resolution.
@@ -128,44 +128,23 @@ class ConfirmedSurfaces:
     def __init__(self, training: Sequence[DepthMap]) -> None:
         grids = [view.on_grid() for view in training]
         bounds = [grid.bounds() for grid in grids]
-        parts = [
+        self._points = [
             _confirmed_points(grid, [(grids[k].camera, *bounds[k]) for k in range(len(grids)) if k != place])
             for place, grid in enumerate(grids)
         ]
-        self._confirmed = [confirmed for confirmed, _ in parts]
-        self._single = [single for _, single in parts]
 
     def nearest(self, camera: Camera) -> Tensor:
-        """Return the depth [H, W] of the nearest confirmed surface in each square of the grid.
-
-        It is 0 without a confirmed surface, and if a surface of a single view may stand in front.
-        """
+        """Return the depth [H, W] of the nearest confirmed surface in each square of the grid; 0 without one."""
         factor = _square(camera)
         grid = camera.downscaled(factor)
-        confirmed = _nearest_depths(self._confirmed, grid)
-        single = _nearest_depths(self._single, grid)
-        free = confirmed.isfinite() & (single >= HAZE_DEPTH * confirmed)
-        nearest = torch.where(free, confirmed, 0.0)
+        depth = torch.full((grid.height * grid.width,), torch.inf, dtype=torch.float64)
+        for points in self._points:
+            (row, column), z, inside = seen_at(points - grid.center, grid)
+            depth.scatter_reduce_(0, (row * grid.width + column)[inside], z[inside], "amin")
+        nearest = torch.where(depth.isfinite(), depth, 0.0).view(grid.height, grid.width)
         rows = (torch.arange(camera.height) // factor).clamp(max=grid.height - 1)
         columns = (torch.arange(camera.width) // factor).clamp(max=grid.width - 1)
         return nearest[rows[:, None], columns]
-
-
-def _nearest_depths(parts: Sequence[Tensor], grid: Camera) -> Tensor:
-    """Return the smallest depth [H, W] of points within 3 x 3 pixels; infinite without a point.
-
-    The neighbors fill the holes between points of views that are farther away than the camera.
-
-    Args:
-        parts: world points [K, 3].
-        grid: camera of the picture.
-    """
-    depth = torch.full((grid.height * grid.width,), torch.inf, dtype=torch.float64)
-    for points in parts:
-        (row, column), z, inside = seen_at(points - grid.center, grid)
-        depth.scatter_reduce_(0, (row * grid.width + column)[inside], z[inside], "amin")
-    picture = depth.view(1, 1, grid.height, grid.width)
-    return -functional.max_pool2d(-picture, 3, 1, 1)[0, 0]
 
 
 def _square(camera: Camera) -> int:
@@ -173,13 +152,8 @@ def _square(camera: Camera) -> int:
     return max(1, camera.width // GRID)
 
 
-def _confirmed_points(
-    grid: DepthMap, others: Sequence[tuple[Camera, Tensor, Tensor]]
-) -> tuple[Tensor, Tensor]:
-    """Return world points [K, 3] of a depth map: confirmed points, and points that no other view judges.
-
-    A point is confirmed if another view has the same depth. It is contradicted, and left out, if no view confirms it
-    and another view sees through it.
+def _confirmed_points(grid: DepthMap, others: Sequence[tuple[Camera, Tensor, Tensor]]) -> Tensor:
+    """Return the world points [K, 3] of a depth map at which another view has the same depth.
 
     Args:
         grid: the depth map.
@@ -187,12 +161,10 @@ def _confirmed_points(
     """
     points = grid.points()[grid.depth.isfinite()]
     confirmed = torch.zeros(len(points), dtype=torch.bool)
-    contradicted = torch.zeros(len(points), dtype=torch.bool)
     for camera, nearest, farthest in others:
         candidates = (~confirmed).nonzero()[:, 0]
         pixels, depth, inside = seen_at(points[candidates] - camera.center, camera)
         hidden = depth > DEPTH_TOLERANCE * farthest[pixels]
         seen_through = DEPTH_TOLERANCE * depth < nearest[pixels]
         confirmed[candidates] = inside & ~hidden & ~seen_through
-        contradicted[candidates] |= inside & seen_through
-    return points[confirmed], points[~confirmed & ~contradicted]
+    return points[confirmed]

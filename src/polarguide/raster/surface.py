@@ -67,8 +67,8 @@ def surface_picture(splats: Splats, camera: Camera) -> SurfacePicture:
 def alpha_in_front(splats: Splats, camera: Camera, depth: Tensor, rasterize: Rasterize) -> Tensor:
     """Return the alpha of the Gaussians whose centers lie in front of the depth at their pixel.
 
-    A center outside the picture is compared with the depth at the nearest border pixel. Gaussians at pixels without a
-    depth do not count.
+    Gaussians with centers outside the picture, or at pixels without a depth, do not count. Wide Gaussians of the ground
+    below a picture would count otherwise.
 
     Args:
         splats: the Gaussians; features are ignored.
@@ -80,7 +80,7 @@ def alpha_in_front(splats: Splats, camera: Camera, depth: Tensor, rasterize: Ras
         Alpha [H, W] in [0, 1]; 0 without Gaussians.
     """
     pose = camera.pose(splats.means.dtype, splats.means.device)
-    pixels, places, _ = seen_at(splats.means - pose.center, camera)
-    front = (places > 0) & (places < depth.to(places)[pixels])
+    pixels, places, inside = seen_at(splats.means - pose.center, camera)
+    front = inside & (places < depth.to(places)[pixels])
     features = splats.features.new_zeros(len(places), 1)
     return rasterize(Splats(*(part[front] for part in splats._replace(features=features))), camera).alpha

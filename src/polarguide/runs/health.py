@@ -127,7 +127,7 @@ HEALTH = "health.json"
 MOST_VIEWS = 64
 """Largest number of examined views."""
 TIME_SHARE = 0.02
-"""Largest number of examined views, as a share of the number of steps. Examining a view takes no longer than a step."""
+"""Largest number of examined training views, as a share of the number of steps. On a CPU, a view takes about a step."""
 CURVE_VIEWS = 4
 """Largest number of held-out views that are scored during a training."""
 NEIGHBORS = 6

@@ -126,18 +126,20 @@ def _of_tiff(data: bytes) -> tuple[bytes | None, Encoding | None]:
 def profile_exponent(profile: bytes) -> float | None:
     """Return the exponent of an ICC profile, see ``Encoding``. Return None for a damaged profile.
 
-    The profile converts a gray to CIE L*, which is ``116 Y^(1/3) - 16`` for the luminance Y.
+    The profile converts grays to CIE L*, which is ``116 Y^(1/3) - 16`` for the luminance Y. L* has 256 levels, so the
+    exponent is a mean over grays near the middle.
     """
     with contextlib.suppress(Exception):  # littlecms raises several kinds of errors
         source = ImageCms.ImageCmsProfile(io.BytesIO(profile))
         mode = "L" if source.profile.xcolor_space == "GRAY" else "RGB"
         target = ImageCms.createProfile("LAB")
         to_lab = ImageCms.buildTransform(source, target, mode, "LAB", ImageCms.Intent.RELATIVE_COLORIMETRIC)
-        gray = Image.new(mode, (1, 1), (_GRAY,) * len(mode))
-        lightness = float(np.asarray(ImageCms.applyTransform(gray, to_lab))[0, 0, 0]) * 100 / 255
+        grays = np.arange(_GRAY - 16, _GRAY + 17, dtype=np.uint8)
+        picture = Image.merge(mode, [Image.fromarray(grays[None])] * len(mode))
+        lightness = np.asarray(ImageCms.applyTransform(picture, to_lab))[0, :, 0] * 100.0 / 255
         luminance = ((lightness + 16) / 116) ** 3
-        if 0 < luminance < 1:
-            return math.log(luminance) / math.log(_GRAY / 255)
+        if luminance.min() > 0 and luminance.max() < 1:
+            return float((np.log(luminance) / np.log(grays / 255.0)).mean())
     return None
 
 
