@@ -8,7 +8,7 @@ are written on request.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
 
@@ -57,7 +57,7 @@ class GaussianModel:
         cls, state: TrainingState, recipe: Recipe, settings: ResolvedSettings, backend: Backend
     ) -> GaussianModel:
         """Return the model of a training's state."""
-        return cls(state, recipe.shading.bind(settings.refractive_index), backend)
+        return cls(state, replace(recipe.shading, refractive_index=settings.refractive_index), backend)
 
     @property
     def device(self) -> torch.device:

@@ -108,7 +108,7 @@ class OpenedRun:
             raise PolarguideError("recipe", expected=expected, found=method.name, remedy=remedy)
         backend = choose_backend(device, say=reporter.say)
         state = load_checkpoint(folder, method, backend.device)
-        if values_differ(method.shading.data(), configuration.recipe_data.get("shading", {})):
+        if values_differ(method.data()["shading"], configuration.recipe_data.get("shading", {})):
             _warn(
                 f"{folder} was trained with other shading values of the recipe {method.name} than those of this "
                 "version, which shades its pictures."

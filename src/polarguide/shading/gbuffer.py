@@ -203,7 +203,7 @@ def render(
         footprints: [N] pixel sizes of the training, which keep magnified pictures smooth, see ``raster.magnification``.
             With None, Gaussians are drawn without additional blur, as in a training.
     """
-    normals = request.normals or shading.reflects
+    normals = request.normals or "specular" in shading.layers
     depth = request.depth
     gaussian_splats, layout = splatting(
         gaussians, camera, shading, sh_degree=request.sh_degree, normals=normals, depth=depth

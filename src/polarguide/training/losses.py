@@ -516,6 +516,7 @@ def normal_terms(step: Step, weights: Weights) -> Tensor:
     shading = step.shading
     if not _native_fits(result, priors):
         return normal_terms_reference(step, weights)
+    has_kernel = type(shading).predicted_stokes is ShadingModel.predicted_stokes
     stokes = None
     directions = []
     consistency = None
@@ -536,9 +537,9 @@ def normal_terms(step: Step, weights: Weights) -> Tensor:
             )
             if factor
         ]
-        if weights.stokes and shading.reflects and not shading.smooth_dielectric:
+        if weights.stokes and result.is_polarized and not has_kernel:
             further = weights.stokes * stokes_loss(result, priors, shading)
-        elif weights.stokes and shading.reflects:
+        elif weights.stokes and result.is_polarized:
             measured = priors.stokes[1:]
             stokes = PolarizationTerm(
                 measured,
@@ -576,7 +577,7 @@ def normal_terms_reference(step: Step, weights: Weights) -> Tensor:
         ):
             if weight and "normal" in result.layers:
                 total = total + weight * loss(result.normal, priors)
-        if weights.stokes and shading.reflects:
+        if weights.stokes and result.is_polarized:
             total = total + weights.stokes * stokes_loss(result, priors, shading)
     if weights.consistency:
         surface = None if priors is None else priors.surface

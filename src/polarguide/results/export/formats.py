@@ -64,6 +64,7 @@ from polarguide.results.rendering.relight import (
 )
 from polarguide.runs.model import write_run_ply
 from polarguide.runs.opened import OpenedRun
+from polarguide.shading.model import radiance_cubemap
 from polarguide.visualization import figures
 
 RECORD = "model.json"
@@ -342,7 +343,7 @@ class _Exporter:
         """
         run = self.run
         lit = replace(self.options, unlit=False)
-        radiant = run.model.shading.radiance_cubemap is not None
+        radiant = radiance_cubemap(run.model.shading) is not None
         if not radiant and lit.base_color is None:
             lit = replace(lit, base_color="diffuse")
         with atomic_folder(self.folder) as parts:
