@@ -21,7 +21,8 @@ from polarguide.training.losses import (
     normal_terms_reference,
     pixel_terms,
 )
-from polarguide.training.targets import Step, StepTargets, ViewPriors, stokes_weight, surface_weight
+from polarguide.training.priors import stokes_weight, surface_weight
+from polarguide.training.targets import Step, StepTargets, ViewPriors
 
 HEIGHT, WIDTH = 37, 70  # more than one block of pixels in a row, and more than one part
 SIZE = (HEIGHT, WIDTH)

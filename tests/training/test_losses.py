@@ -28,7 +28,8 @@ from polarguide.training.losses import (
     term,
 )
 from polarguide.training.photometric import photometric_loss
-from polarguide.training.targets import Step, StepTargets, ViewPriors, stokes_weight, surface_weight
+from polarguide.training.priors import stokes_weight, surface_weight
+from polarguide.training.targets import Step, StepTargets, ViewPriors
 
 SIZE = (12, 14)
 GLASS = DeferredShading("fresnel")
