@@ -113,7 +113,8 @@ class OpenedRun:
                 f"{folder} was trained with other shading values of the recipe {method.name} than those of this "
                 "version, which shades its pictures."
             )
-        model = GaussianModel.of(state, method, configuration.settings, backend)
+        shading = replace(method.shading, refractive_index=configuration.settings.refractive_index)
+        model = GaussianModel(state, shading, backend)
         return cls(folder, configuration, method, model, scene=scene, reporter=reporter)
 
     @classmethod

@@ -258,6 +258,7 @@ def view_priors(
     if by_color is not None:
         nearest_to = torch.where(by_color[1][..., None] > 0, by_color[0], guide.normal)
     candidates = _candidates(settings.candidates, luminance, rays, refractive_index)
+    normals = candidates if isinstance(candidates, Tensor) else candidates.normals
     chosen = optics.disambiguate(candidates, nearest_to, rays, azimuth_weight=settings.azimuth_weight).normal
     layers = _separated(stokes, guide, settings, refractive_index, rays)
     conditioned = layers.conditioned & ~view.saturated
@@ -287,7 +288,7 @@ def view_priors(
         stokes=stokes,
         stokes_weight=stokes_weight(stokes, reliable),
         surface=surface_weight(stokes, weight, settings.bright),
-        candidates=view.camera.to_world(_normals(candidates)) if settings.live else None,
+        candidates=view.camera.to_world(normals) if settings.live else None,
         azimuth_share=settings.azimuth_share,
         chromatic_share=settings.chromatic_share,
     )
@@ -452,11 +453,6 @@ def _candidates(
     return torch.stack(
         [optics.normal_from_angles(paper.zenith, azimuth, rays) for azimuth in quarters], dim=-2
     )
-
-
-def _normals(candidates: optics.Candidates | optics.PhysicalCandidates | Tensor) -> Tensor:
-    """Return the normals [H, W, K, 3] of candidates."""
-    return candidates if isinstance(candidates, Tensor) else candidates.normals
 
 
 def facing(zenith: Tensor, azimuth: Tensor, guide: Tensor, rays: Tensor) -> Tensor:

@@ -82,11 +82,6 @@ FILES = {
 }
 
 
-def about_files(names: list[str]) -> dict[str, str]:
-    """Return a description of each file by name."""
-    return {name: FILES[name] for name in names}
-
-
 def package_record(run: OpenedRun, placement: Placement, origin: Origin, base_color: str) -> dict[str, Any]:
     """Return the content of ``model.json`` except the list of files.
 
@@ -363,7 +358,8 @@ class _Exporter:
             placement = self.presented.upright(run)
             meaning = BASE_COLORS[lit.resolved_base_color]
             record = package_record(run, placement, self.presented.origin, meaning)
-            write_text(parts / RECORD, json.dumps({**record, "files": about_files(names)}, indent=1) + "\n")
+            record["files"] = {name: FILES[name] for name in names}
+            write_text(parts / RECORD, json.dumps(record, indent=1) + "\n")
         return [self.folder / name for name in [RECORD, *names]]
 
     def environment(self) -> list[Path]:

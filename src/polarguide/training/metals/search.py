@@ -188,7 +188,7 @@ def evidence(
         none = labels.new_zeros(len(labels))
         gray = labels.new_full((len(labels), 3), FIRST_REFLECTANCE)
         return MetalEvidence(none, none, gray, torch.zeros_like(gray), labels)
-    looks = view_sums(gaussians, memory.between(measured), rasterize, limits)
+    looks = [view_sums(gaussians, view, rasterize, limits.least_normal) for view in memory.between(measured)]
     result = of_views(looks, labels, refractive_index, rules, limits)
     del looks
     memory.clear()
