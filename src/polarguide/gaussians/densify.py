@@ -124,14 +124,6 @@ class DensityStatistics:
         self._device = device
         self.clear(count)
 
-    @classmethod
-    def of(cls, gradient: Tensor, counts: Tensor) -> DensityStatistics:
-        """Create statistics from existing sums."""
-        statistics = cls(0, gradient.device)
-        statistics.gradient = gradient
-        statistics.seen = counts
-        return statistics
-
     def add(self, screen_gradient: Tensor, radii: Tensor, width: int, height: int) -> None:
         """Add one picture.
 

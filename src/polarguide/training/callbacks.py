@@ -315,7 +315,8 @@ class DensityControl(Callback[TrainingLoop]):
         return {"gradient": self._statistics.gradient, "seen": self._statistics.seen}
 
     def load_state_dict(self, tensors: Mapping[str, Tensor]) -> None:
-        self._statistics = DensityStatistics.of(tensors["gradient"], tensors["seen"])
+        self._statistics.gradient = tensors["gradient"]
+        self._statistics.seen = tensors["seen"]
 
     def _prune_untouched(self, loop: TrainingLoop) -> None:
         """Remove Gaussians that contribute too little to the training views.
