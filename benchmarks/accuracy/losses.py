@@ -139,13 +139,15 @@ def loss_tables(scenes: Scenes, recipe: str, others: Sequence[str]) -> Iterator[
     judged = judged_scenes(scenes, recipe, others)
     whole = [one for one in judged if not one.part]
     parts = [one for one in judged if one.part]
-    yield f"`{recipe}` loses {count(whole)} comparisons by scene and {count(parts)} by object.\n"
+    yield f"`{recipe}` loses {count(whole)} comparisons by scene and {count(parts)} by object."
+    yield ""
     yield "| scene | losses by scene | losses by object |"
     yield "|---|---:|---:|"
     for scene in dict.fromkeys(one.scene for one in judged):
         counts = [count([one for one in of if one.scene == scene]) for of in (whole, parts)]
         yield f"| `{scene}` | {' | '.join(counts)} |"
-    yield "\n| recipe | losses | by scene | by object | pictures | normals | layers |"
+    yield ""
+    yield "| recipe | losses | by scene | by object | pictures | normals | layers |"
     yield "|---|---:|---:|---:|---:|---:|---:|"
     for name in (recipe, *others):
         of_name = judged_scenes(scenes, name, [other for other in others if other != name])
@@ -154,7 +156,8 @@ def loss_tables(scenes: Scenes, recipe: str, others: Sequence[str]) -> Iterator[
         kinds = [sum(one.key in kind for one in lost) for kind in (PICTURE, NORMALS, LAYERS)]
         if of_name:
             yield f"| `{name}` | {count(of_name)} | {' | '.join(map(str, (*by_part, *kinds)))} |"
-    yield "\n| scene | object | metric | value | best without polarization | difference |"
+    yield ""
+    yield "| scene | object | metric | value | best without polarization | difference |"
     yield "|---|---|---|---:|---:|---:|"
     yield from (one.line() for one in judged if one.lost)
 
