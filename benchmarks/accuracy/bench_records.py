@@ -67,3 +67,13 @@ def read_scenes(paths: Sequence[Path]) -> dict[str, dict[str, dict[int, Any]]]:
                     rows = scenes.setdefault(run["scene"], {})
                     rows.setdefault(run["recipe"], {})[run["seed"]] = run
     return scenes
+
+
+def code_versions(paths: Sequence[Path]) -> list[str]:
+    """Return the commits of the code that wrote the records, without repetition. Without a commit, it is the digest.
+
+    Raises:
+        PolarguideError: a file is not a record.
+    """
+    provenances = [read_results(path).provenance for path in paths]
+    return list(dict.fromkeys(provenance.commit or provenance.sources for provenance in provenances))

@@ -20,6 +20,7 @@ from bench_records import (
     Scenes,
     Value,
     by_scene,
+    code_versions,
     objects_of,
     of_material,
     of_object,
@@ -123,7 +124,7 @@ def mean_table(scenes: Scenes) -> Iterator[str]:
 
 def control_table(scenes: Scenes) -> Iterator[str]:
     """Yield a table of the gain by polarization on each scene."""
-    columns = shown_columns(scenes)
+    columns = {key: heading for key, heading in shown_columns(scenes).items() if not BY_KEY[key].timed}
     yield f"| scene | {' | '.join(columns.values())} |"
     yield f"|---|{'---|' * len(columns)}"
     for scene, rows in scenes.items():
@@ -195,8 +196,11 @@ def main() -> None:
     options = parser.parse_args()
     try:
         scenes = read_scenes(options.records)
+        versions = code_versions(options.records)
     except PolarguideError as error:
         parser.error(str(error))
+    comparable = "" if len(versions) == 1 else " Values of different versions are not comparable."
+    print(f"Version of the code: {', '.join(versions)}.{comparable}\n")
     print(*tables(scenes, options.against), sep="\n")
 
 
