@@ -48,7 +48,7 @@ class Part(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         folder: subfolder of the scenes.
         downscale: factor by which pictures are reduced.
         refractive_index: refractive index of all scenes, or None if each scene has its own.
-        against: reference recipe of the differences.
+        against: reference recipe of the differences, or None without differences.
     """
 
     about: str
@@ -58,7 +58,7 @@ class Part(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     folder: str = ""
     downscale: int = 1
     refractive_index: float | None = None
-    against: str = "3dgs-dr"
+    against: str | None = None
 
 
 def read_part(path: Path) -> Part:
