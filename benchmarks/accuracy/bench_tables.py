@@ -171,13 +171,17 @@ def shown_columns(scenes: Scenes) -> dict[str, str]:
 
 
 def tables(scenes: Scenes, others: Sequence[str]) -> Iterator[str]:
-    """Yield all tables. Losses are counted against the recipes ``others``, which have no polarization."""
+    """Yield all tables. Losses are counted against the recipes ``others``, which have no polarization.
+
+    Scenes without runs of the default recipe have only tables of means.
+    """
     ours = {scene: rows for scene, rows in scenes.items() if RECIPE in rows}
-    yield from ("## Losses\n", *loss_tables(ours, RECIPE, others))
-    yield from ("\n## Mean gains\n", *gain_table(ours, RECIPE, others))
+    if ours:
+        yield from ("## Losses\n", *loss_tables(ours, RECIPE, others))
+        yield from ("\n## Mean gains\n", *gain_table(ours, RECIPE, others))
+        yield from ("\n## By material\n", *material_table(ours))
+        yield from ("\n## Gain by polarization\n", *control_table(ours))
     yield from ("\n## Mean over scenes\n", *mean_table(scenes))
-    yield from ("\n## By material\n", *material_table(ours))
-    yield from ("\n## Gain by polarization\n", *control_table(ours))
     for scene, rows in scenes.items():
         yield from (f"\n## {scene}\n", *scene_table(rows), "")
         if scene in ours:

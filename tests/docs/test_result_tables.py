@@ -71,6 +71,7 @@ def assert_equal_tables(stated, computed, names):
         ("index", ("recipe, four scenes",), "four", FOUR, LAYERS),
         ("index", ("recipe", "PSNR", "Stokes error"), "four", ("wwbottle",), {}),
         ("bench-held-back", ("recipe", "PSNR"), "bench", HELD_BACK, LAYERS),
+        ("captures", ("angles of each view",), "", ("exposures",), LAYERS),
     ],
 )
 def test_means_over_scenes(page, headings, folder, scenes, layers):
