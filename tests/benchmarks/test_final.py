@@ -1,20 +1,26 @@
 """Lists of the final measurement, and the scene files of the held-back half."""
 
+import json
+import shutil
 import sys
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
+from polarguide.capture import load_scene
+from polarguide.capture.layout import find_layout
 from polarguide.core.errors import PolarguideError
 from polarguide_bench.options import BENCH
 from polarguide_synth.colmap import place_cameras
 from polarguide_synth.settings import find_scene
 
 BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
-sys.path += [str(BENCHMARKS / "final"), str(BENCHMARKS / "heldout")]
+sys.path += [str(BENCHMARKS / name) for name in ("accuracy", "final", "heldout")]
 import measure  # noqa: E402
 import render  # noqa: E402
+from simulated_mosaics import FULL, linear_intensities, mosaic  # noqa: E402
 
 
 @pytest.mark.parametrize("name", measure.PARTS)
@@ -70,3 +76,40 @@ def test_all_cameras_are_inside_the_small_room() -> None:
     centers = np.stack([camera.center.numpy() for camera in cameras])
     assert np.abs(centers[:, :2]).max() < 1.5
     assert 0.7 < centers[:, 2].min() < centers[:, 2].max() < 2.3
+
+
+@pytest.fixture
+def rendering(demo_scene: Path, tmp_path: Path) -> Path:
+    """The demo scene as ``synth`` would write it with a sensor."""
+    folder = tmp_path / "rendering"
+    for name in ("gt", "sparse"):
+        shutil.copytree(demo_scene / name, folder / name)
+    for name in ("split.json", "scene.json"):
+        shutil.copyfile(demo_scene / name, folder / name)
+    (folder / "calibration.json").write_text(
+        json.dumps({"gains": dict.fromkeys(("0", "45", "90", "135"), 1.0)})
+    )
+    (folder / "raw").mkdir()
+    layout = find_layout(demo_scene)
+    for view in layout.names:
+        light = mosaic(linear_intensities(layout, view, "linear"), electrons=0, rng=np.random.default_rng(0))
+        values = np.rint(64 + light.astype(float) * (4095 - 64) / FULL).astype(np.uint16)
+        assert cv2.imwrite(str(folder / "raw" / f"{view}.png"), values)
+    return folder
+
+
+def test_a_prepared_rendering_has_ground_truth(rendering: Path, demo_scene: Path, tmp_path: Path) -> None:
+    out = tmp_path / "scene"
+    for _ in range(2):  # the second call changes nothing
+        render.prepare_rendering(rendering, out)
+    prepared = load_scene(out)
+    demo = load_scene(demo_scene)
+    assert prepared.test_names == demo.test_names
+    assert prepared.objects == demo.objects
+    for name in demo.test_names:
+        view = prepared.view(name)
+        assert view.ground_truth is not None
+        valid = ~(view.invalid | view.saturated)
+        difference = view.photograph() - demo.view(name).photograph()
+        assert difference[valid].abs().median() < 0.01
+        assert view.ground_truth.normal is not None
