@@ -23,9 +23,9 @@ from pathlib import Path
 import msgspec
 
 import polarguide
-from polarguide.cli.console import ConsoleReporter, say, set_threads
 from polarguide.core.errors import PolarguideError
 from polarguide.core.files import make_folder
+from polarguide.core.progress import Reporter
 from polarguide.core.records import read_record
 from polarguide.training.settings import TrainSettings
 from polarguide_bench.options import CompareOptions
@@ -35,6 +35,18 @@ HERE = Path(__file__).resolve().parent
 RECORDS = HERE.parent / "results" / "final"
 PARTS = ("heldout", "four", "bench", "publication", "gnerp", "ablations")
 """Parts in the order of the measurement."""
+
+
+class MessageReporter(Reporter):
+    """Reporter that prints messages without progress."""
+
+    def say(self, text: str) -> None:
+        """Print a message."""
+        print(text, flush=True)
+
+    def warn(self, text: str) -> None:
+        """Print a warning."""
+        print(f"warning: {text}", flush=True)
 
 
 class Part(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -94,7 +106,7 @@ def measure(part: Part, scenes: Path, out: Path, *, jobs: int, threads: int) -> 
         ),
         seeds_of=part.recipes,
         command_line=shlex.join(["python", *sys.argv]),
-        reporter=ConsoleReporter(),
+        reporter=MessageReporter(),
     )
 
 
@@ -109,7 +121,6 @@ def main() -> None:
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--threads", type=int, default=1)
     options = parser.parse_args()
-    set_threads(options.threads)
     try:
         parts = {
             Path(name).stem: read_part(HERE / f"{name}.json" if name in PARTS else Path(name))
@@ -117,7 +128,7 @@ def main() -> None:
         }
         make_folder(options.records)
         for name, part in parts.items():
-            say(f"{name}: {part.about}")
+            print(f"{name}: {part.about}", flush=True)
             out = options.out / name
             try:
                 measure(part, options.scenes, out, jobs=options.jobs, threads=options.threads)

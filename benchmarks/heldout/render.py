@@ -21,10 +21,11 @@ from pathlib import Path
 
 import polarguide
 from polarguide.capture.calibration import read_calibration
-from polarguide.cli.console import ConsoleReporter, say, set_threads
 from polarguide.core.errors import PolarguideError
 from polarguide.core.files import write_text
+from polarguide.core.progress import SILENT
 from polarguide.preparation.settings import PrepareSettings
+from polarguide.raster import use_threads
 from polarguide_synth.folder import scene_digest
 from polarguide_synth.render import synthesize
 from polarguide_synth.sensor import Sensor
@@ -51,7 +52,7 @@ def prepare_rendering(rendered: Path, out: Path) -> None:
         poses=str(rendered),
         calibration=read_calibration(rendered / "calibration.json"),
     )
-    polarguide.prepare(rendered / "raw", out, settings=settings, reporter=ConsoleReporter())
+    polarguide.prepare(rendered / "raw", out, settings=settings)
     shutil.copytree(rendered / "gt", out / "gt", dirs_exist_ok=True)
     shutil.copyfile(rendered / "split.json", out / "split.json")
     objects = json.loads((rendered / "scene.json").read_text(encoding="utf-8"))["objects"]
@@ -62,7 +63,7 @@ def prepare_rendering(rendered: Path, out: Path) -> None:
 def make_scene(name: str, out: Path, threads: int) -> dict[str, str]:
     """Render and prepare a scene, and return the SHA-256 of the rendering and of the prepared scene."""
     rendered = out / "rendered" / name
-    synthesize(find_scene(str(HERE / f"{name}.json")), rendered, SYNTH, ConsoleReporter(), threads=threads)
+    synthesize(find_scene(str(HERE / f"{name}.json")), rendered, SYNTH, SILENT, threads=threads)
     prepare_rendering(rendered, out / name)
     return {"rendered": scene_digest(rendered), "prepared": polarguide.load_scene(out / name).digest}
 
@@ -75,15 +76,18 @@ def main() -> None:
     parser.add_argument("--scenes", nargs="+", choices=SCENES, default=SCENES)
     parser.add_argument("--threads", type=int, default=1)
     options = parser.parse_args()
-    set_threads(options.threads)
+    use_threads(options.threads)
     recorded = json.loads(CHECKSUMS.read_text(encoding="utf-8")) if CHECKSUMS.exists() else {}
     differing = []
     for name in options.scenes:
+        print(f"rendering {name}", flush=True)
         try:
             made = make_scene(name, options.out, options.threads)
         except PolarguideError as error:
             parser.error(str(error))
-        say(f"{options.out / name}   rendering {made['rendered']}   prepared {made['prepared']}")
+        print(
+            f"{options.out / name}   rendering {made['rendered']}   prepared {made['prepared']}", flush=True
+        )
         if recorded.setdefault(name, made) != made:
             differing.append(name)
     write_text(CHECKSUMS, json.dumps(recorded, indent=1) + "\n")
