@@ -3,9 +3,12 @@
     python benchmarks/final/measure.py SCENES OUT [--parts four bench ...] [--jobs 1] [--threads 1]
 
 Each JSON file in this folder is a part: scenes, recipes with their numbers of seeds, and settings. SCENES contains the
-scene folders, in a subfolder if the part names one. Each part is a comparison in OUT/PART. Its record is copied to
-benchmarks/results/final/PART.json after the part, and after Ctrl-C. The same command resumes; finished runs are not
-repeated. To add seeds, change the number in the part and repeat the command. The tables are printed by
+scene folders, in a subfolder if the part names one. SCENES/heldout is the output of benchmarks/heldout/render.py, and
+SCENES/bench is the folder scenes of polarguide bench --render-only.
+
+Each part is a comparison in OUT/PART. Its record is copied to benchmarks/results/final/PART.json after the part, and
+after Ctrl-C. The same command resumes; finished runs are not repeated. To add seeds, change the number in the part and
+repeat the command. The tables are printed by
 
     python benchmarks/accuracy/bench_tables.py benchmarks/results/final/PART.json
 
@@ -33,7 +36,7 @@ from polarguide_bench.recipes import recipe_named
 
 HERE = Path(__file__).resolve().parent
 RECORDS = HERE.parent / "results" / "final"
-PARTS = ("heldout", "four", "bench", "publication", "gnerp", "ablations")
+PARTS = ("heldout", "four", "bench", "real", "publication", "gnerp", "ablations")
 """Parts in the order of the measurement."""
 
 

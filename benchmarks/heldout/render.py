@@ -7,8 +7,9 @@ it is part of the measurement. The ground truth and the held-out views of the re
     python benchmarks/heldout/render.py OUT [--scenes NAME ...] [--threads 1]
 
 Writes OUT/rendered/NAME and the scene folder OUT/NAME. The same command resumes after Ctrl-C. ``checksums.json``
-contains the SHA-256 of the files of each rendering and of each prepared scene. Missing values are added. A difference
-is reported, and the exit status is then 1: processors with other instructions round differently.
+contains the SHA-256 of each rendering, which is the SHA-256 of its ``checksums.txt``. Missing values are added. A
+difference is reported, and the exit status is then 1: processors with other instructions round differently. The
+prepared scenes depend on the version of ``prepare``. Records of comparisons contain their digests.
 """
 
 from __future__ import annotations
@@ -60,12 +61,12 @@ def prepare_rendering(rendered: Path, out: Path) -> None:
     write_text(out / "scene.json", json.dumps({**scene, "objects": objects}, indent=1) + "\n")
 
 
-def make_scene(name: str, out: Path, threads: int) -> dict[str, str]:
-    """Render and prepare a scene, and return the SHA-256 of the rendering and of the prepared scene."""
+def make_scene(name: str, out: Path, threads: int) -> str:
+    """Render and prepare a scene, and return the SHA-256 of the rendering."""
     rendered = out / "rendered" / name
     synthesize(find_scene(str(HERE / f"{name}.json")), rendered, SYNTH, SILENT, threads=threads)
     prepare_rendering(rendered, out / name)
-    return {"rendered": scene_digest(rendered), "prepared": polarguide.load_scene(out / name).digest}
+    return scene_digest(rendered)
 
 
 def main() -> None:
@@ -85,9 +86,7 @@ def main() -> None:
             made = make_scene(name, options.out, options.threads)
         except PolarguideError as error:
             parser.error(str(error))
-        print(
-            f"{options.out / name}   rendering {made['rendered']}   prepared {made['prepared']}", flush=True
-        )
+        print(f"{options.out / name}   SHA-256 of the rendering: {made}", flush=True)
         if recorded.setdefault(name, made) != made:
             differing.append(name)
     write_text(CHECKSUMS, json.dumps(recorded, indent=1) + "\n")
