@@ -82,7 +82,7 @@ def read_part(path: Path) -> Part:
     Raises:
         PolarguideError: the file is invalid, or a recipe is unknown.
     """
-    part = read_record(path, Part, remedy="Correct the file.")
+    part = read_record(path, Part, remedy="Name a part of benchmarks/final, or a valid JSON file.")
     for name in part.recipes:
         recipe_named(name)
     return part

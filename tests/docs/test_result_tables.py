@@ -1,7 +1,9 @@
 """Tables of docs/results, computed again from the records in benchmarks/results."""
 
+import json
 import sys
 from pathlib import Path
+from statistics import fmean, stdev
 
 import pytest
 
@@ -14,7 +16,7 @@ RECORDS = ROOT / "benchmarks" / "results"
 sys.path.append(str(ROOT / "benchmarks" / "accuracy"))
 import bench_tables  # noqa: E402
 import losses  # noqa: E402
-from bench_records import read_scenes  # noqa: E402
+from bench_records import of_run, read_scenes, values  # noqa: E402
 
 DEVELOPMENT = ("figure", "kit", "car", "water", "metals-a", "ceramic-a")
 HELD_BACK = ("metals-b", "ceramic-b", "cup", "rough", "lacquer")
@@ -33,7 +35,7 @@ def tables_of(lines):
     tables = []
     header = None
     for line in lines:
-        cells = [cell.strip() for cell in line.strip().strip("|").split(" | ")] if line[:1] == "|" else None
+        cells = [cell.strip() for cell in line.split("|")[1:-1]] if line[:1] == "|" else None
         if cells is None:
             header = None
         elif header is None:
@@ -132,6 +134,57 @@ def test_tables_of_the_publication(layout, last):
         for labels, cells in rows
     ]
     assert [[*row.values()] for row in page_table("publication", *headings)] == computed
+
+
+FIVE = ("psnr", "psnr_foreground", "normal_mae_deg", "specular_psnr", "diffuse_psnr")
+
+
+def test_five_values_of_the_publication():
+    scenes = read_scenes([RECORDS / "publication.json"])
+    for row in page_table("publication", "recipe", "`spheres`"):
+        recipe, *cells, mean = row.values()
+        computed = [
+            [fmean(values(scenes[scene.strip("`")][recipe.strip("`")], of_run(key)).values()) for key in FIVE]
+            for scene in [*row][1:-1]
+        ]
+        assert cells == [" / ".join(f"{value:.1f}" for value in of) for of in computed]
+        assert mean == " / ".join(f"{fmean(of):.1f}" for of in zip(*computed, strict=True))
+
+
+def test_polgs():
+    runs = json.loads((ROOT / "benchmarks" / "records" / "polgs.json").read_text(encoding="utf-8"))["runs"]
+    keys = {**dict.fromkeys(FIVE, 1), "stokes_error": 2, "depth_error_median_percent": 2}
+    means = {}
+    for row in page_table("index", "scene", "recipe"):
+        scene, recipe, *cells = (cell.strip("`") for cell in row.values())
+        numbers = [
+            [run[key] for name, run in runs.items() if name.startswith(f"{scene}/{recipe}/")] for key in keys
+        ]
+        if scene == "mean":
+            computed = [fmean(of) for of in zip(*means[recipe], strict=True)]
+            assert cells == [f"{value:.{n}f}" for value, n in zip(computed, keys.values(), strict=True)]
+        else:
+            means.setdefault(recipe, []).append([fmean(of) for of in numbers])
+            assert cells == [
+                f"{fmean(of):.{n}f} ± {stdev(of):.{n}f}" for of, n in zip(numbers, keys.values(), strict=True)
+            ]
+
+
+def test_normals_of_gnerp():
+    scenes = read_scenes([RECORDS / f"gnerp{name}.json" for name in ("", "-car", "-water", "-circular")])
+    (table,) = (
+        table
+        for table in tables_of(
+            (ROOT / "docs" / "reference" / "gnerp.md").read_text(encoding="utf-8").splitlines()
+        )
+        if tuple(table[0])[:2] == ("recipe", "`spheres`")
+    )
+    for row in table:
+        recipe = row.pop("recipe").strip("`")
+        for scene, cell in row.items():
+            rows = scenes[scene.strip("`")]
+            found = values(rows.get(recipe, {}), of_run("normal_mae_deg")).values()
+            assert cell == "".join(f"{value:.1f}°" for value in found)
 
 
 @pytest.mark.parametrize("recipe", ["polarguide-stokes", "polarguide"])
