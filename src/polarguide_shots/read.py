@@ -28,7 +28,6 @@ from polarguide.capture.develop import (
     pair_gains,
     sample_blocks,
 )
-from polarguide.capture.exposure_files import all_exposures
 from polarguide.capture.exposures import FOUR, Angle, normalized
 from polarguide.capture.filter.camera_files import apply_orientation
 from polarguide.capture.filter.develop import moved_shots
@@ -37,6 +36,7 @@ from polarguide.capture.filter.shots import _READ, require_four_shots, stacked
 from polarguide.capture.layout import (
     KEPT,
     READ,
+    all_exposures,
     find_layout,
     require_memory_of_each,
     select_views,

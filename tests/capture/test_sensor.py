@@ -13,15 +13,19 @@ from faults import Fault
 from polarguide.capture.develop import sample_blocks
 from polarguide.capture.sensor.demosaic import DEMOSAIC_MODES, DemosaicedPicture, demosaic
 from polarguide.capture.sensor.pattern import (
+    PACKINGS,
     SENSORS,
     SIDE,
     MosaicOptions,
+    RawFormat,
     color_filters,
     estimate_levels,
+    packed_size,
+    read_mosaic,
     sensor_pattern,
+    unpack,
     unusable_samples,
 )
-from polarguide.capture.sensor.raw_file import PACKINGS, RawFormat, packed_size, read_mosaic, unpack
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import PrepareSettings
 from polarguide_shots.calibration.settings import CalibrateSettings

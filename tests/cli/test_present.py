@@ -17,7 +17,7 @@ from polarguide.capture.presentation import PRESENTATION_FILE, Crop, Presentatio
 from polarguide.cli.app import run
 from polarguide.gaussians.ply import read_ply
 from polarguide.results.rendering import picking
-from polarguide.results.rendering.film import path_cameras
+from polarguide.results.rendering.pictures import path_cameras
 
 ONE = ("--threads", "1")
 

@@ -36,8 +36,14 @@ from polarguide.capture.filter.encoding import (
 from polarguide.capture.filter.shots import Shots, read_stack, stacked
 from polarguide.capture.formats.pictures import decode_mask, decode_picture
 from polarguide.capture.sensor.demosaic import defects
-from polarguide.capture.sensor.pattern import estimate_levels, sensor_pattern, tiled
-from polarguide.capture.sensor.raw_file import PACKINGS, RawFormat, read_mosaic
+from polarguide.capture.sensor.pattern import (
+    PACKINGS,
+    RawFormat,
+    estimate_levels,
+    read_mosaic,
+    sensor_pattern,
+    tiled,
+)
 from polarguide.optics.color import srgb_encode_array as srgb_encode
 from polarguide.preparation.filter_source import SinglesSource
 from polarguide.preparation.prepare import prepare_scene

@@ -12,7 +12,7 @@ from faults import Fault
 
 import polarguide
 from polarguide import optics
-from polarguide.geometry.vectors import unit
+from polarguide.geometry.camera import unit
 from polarguide.results.rendering.pictures import resolving_normals
 from polarguide_shots.exposures import find_shots
 from polarguide_shots.maps import Developed, NoiseModel, ShotMaps

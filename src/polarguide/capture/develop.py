@@ -58,13 +58,15 @@ from polarguide.capture.sensor.pattern import (
     SENSOR_NAMES,
     SENSOR_SIZES,
     Levels,
+    RawFormat,
     estimate_levels,
     level_notes,
+    read_mosaic,
+    require_mosaic,
     sensor_pattern,
     tiled,
     unusable_samples,
 )
-from polarguide.capture.sensor.raw_file import RawFormat, read_mosaic, require_mosaic
 from polarguide.capture.view import FULL_CODE
 from polarguide.capture.view_reader import require_alike
 from polarguide.core.errors import PolarguideError, require

@@ -9,8 +9,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from polarguide.geometry.camera import Camera
-from polarguide.geometry.vectors import unit
+from polarguide.geometry.camera import Camera, unit
 
 _LEAST_SPREAD = 1e-4
 """Smallest eigenvalue of the least-squares system for which optical axes count as intersecting."""

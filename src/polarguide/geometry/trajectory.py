@@ -22,9 +22,8 @@ from torch import Tensor
 
 from polarguide.core.errors import require
 from polarguide.core.records import read_record
-from polarguide.geometry.camera import FARTHEST, LENS, Camera, can_be_lens, look_at
+from polarguide.geometry.camera import FARTHEST, LENS, Camera, can_be_lens, dot, look_at, unit
 from polarguide.geometry.scene_frame import SceneFrame, scene_frame
-from polarguide.geometry.vectors import dot, unit
 
 LARGEST_SIDE = 8192
 """Maximum side of a picture in a file, in pixels."""

@@ -33,7 +33,6 @@ from polarguide.capture.develop import (
     require_one,
     stated_exposures,
 )
-from polarguide.capture.exposure_files import all_exposures, exposure_tables
 from polarguide.capture.exposures import TABLE, Angle, angle_text, turned
 from polarguide.capture.filter.camera_files import (
     Lens,
@@ -59,7 +58,7 @@ from polarguide.capture.filter.shots import (
     require_four_shots,
 )
 from polarguide.capture.formats.pictures import decode_mask, decode_picture, read_picture, stated_size
-from polarguide.capture.layout import require_memory_of_each
+from polarguide.capture.layout import all_exposures, exposure_tables, require_memory_of_each
 from polarguide.capture.point_exposures import (
     FEWEST,
     ComparedPoints,
@@ -74,16 +73,18 @@ from polarguide.core.errors import PolarguideWarning, require
 from polarguide.core.files import write_whole
 from polarguide.core.progress import Advance, Reporter
 from polarguide.optics.color import srgb_decode_array
-from polarguide.preparation.journal import (
+from polarguide.preparation.settings import FilterSettings, SinglesSettings
+from polarguide.preparation.source import (
+    DevelopedView,
     ExposureRecord,
     Factor,
     Measured,
+    Source,
+    Stored,
     StoredRounding,
     ViewRecord,
     stops_record,
 )
-from polarguide.preparation.settings import FilterSettings, SinglesSettings
-from polarguide.preparation.source import DevelopedView, Source, Stored
 
 _JUDGED_VIEWS = 8
 _GAINS = {

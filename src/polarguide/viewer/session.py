@@ -13,10 +13,13 @@ from polarguide.capture.presentation import PRESENTATION_FILE, Presentation
 from polarguide.core.records import to_json
 from polarguide.geometry.camera import Camera
 from polarguide.geometry.scene_frame import SceneFrame
-from polarguide.viewer.cameras import (
+from polarguide.viewer.panel import FREE_VIEW, Panel, PanelOptions
+from polarguide.viewer.scenery import (
     MOST_KEYFRAMES,
     Frusta,
+    Painter,
     Photograph,
+    Scenery,
     ViewPose,
     free_camera,
     keyframe,
@@ -24,8 +27,6 @@ from polarguide.viewer.cameras import (
     move_to_view,
     path_json,
 )
-from polarguide.viewer.panel import FREE_VIEW, Panel, PanelOptions
-from polarguide.viewer.scenery import Painter, Scenery
 from polarguide.visualization.figures import png_bytes
 
 REST = 0.25  # seconds without a change before a sharp picture

@@ -32,15 +32,17 @@ from scipy.optimize import least_squares
 from polarguide.capture.develop import sample_blocks
 from polarguide.capture.layout import describe_contents, index_files
 from polarguide.capture.sensor.pattern import (
+    RAW_SUFFIXES,
     SIDE,
     Levels,
     Pattern,
+    RawFormat,
     agreed_full_scale,
     estimate_levels,
+    read_mosaic,
     require_kind,
     sensor_pattern,
 )
-from polarguide.capture.sensor.raw_file import RAW_SUFFIXES, RawFormat, read_mosaic
 from polarguide.core.errors import require
 from polarguide.core.files import require_folder
 from polarguide.core.progress import Reporter

@@ -31,9 +31,8 @@ from polarguide.results.export.model.irradiance import Surroundings, arriving_li
 from polarguide.results.export.model.topology import Topology, cleaned, topology
 from polarguide.results.export.model.unwrap import Unwrapped, rasterized_texels, unwrap
 from polarguide.results.export.placement import IN_PLACE
-from polarguide.results.rendering.mesh import ColoredMesh, Surface
+from polarguide.results.rendering.mesh import ColoredMesh, Surface, subject_of
 from polarguide.results.rendering.relight import mirrored_light
-from polarguide.results.rendering.subject import subject_of
 from polarguide.shading.deferred import DeferredShading
 from polarguide.shading.result import RenderResult
 

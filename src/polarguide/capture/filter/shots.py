@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from polarguide.capture.exposure_files import index_shot_files, list_shot_files, shot_stem
 from polarguide.capture.exposures import (
     NAMING,
     TABLE,
@@ -31,10 +30,12 @@ from polarguide.capture.formats.pictures import SUFFIXES, decode_picture, is_los
 from polarguide.capture.layout import (
     ambiguous,
     angle_folders,
+    index_shot_files,
+    list_shot_files,
     require_angle_folders,
+    shot_stem,
 )
-from polarguide.capture.sensor.pattern import Levels
-from polarguide.capture.sensor.raw_file import RAW_SUFFIXES
+from polarguide.capture.sensor.pattern import RAW_SUFFIXES, Levels
 from polarguide.capture.view import ANGLES
 from polarguide.capture.view_reader import require_alike
 from polarguide.core.errors import PolarguideError, require

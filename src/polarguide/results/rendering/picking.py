@@ -11,8 +11,7 @@ from torch import Tensor
 from polarguide.capture import View
 from polarguide.capture.presentation import Vector
 from polarguide.core.errors import PolarguideError
-from polarguide.geometry.camera import Camera
-from polarguide.geometry.vectors import unit
+from polarguide.geometry.camera import Camera, unit
 from polarguide.shading.result import RenderResult
 
 LEAST_ALPHA = 0.5  # minimum alpha of a surface

@@ -223,7 +223,7 @@ def present(
         distance: their distance, such as ``85mm``.
         meters_per_unit: length of one unit of the scene, or ``none``.
         crop: left,right,down,up,front,back in percent of the cameras' distance, as in the viewer; ``all``: the
-            whole scene; ``none``: the subject, see ``results.rendering.subject``.
+            whole scene; ``none``: the subject, see ``results.rendering.mesh``.
         title, author, license, provenance: one line of text each; ``none`` or an empty text removes it.
         scene: new folder of a moved scene, which ``run.json`` of the run then names.
         device: device of the rendering.

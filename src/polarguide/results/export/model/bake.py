@@ -19,8 +19,7 @@ from torch.nn.functional import grid_sample, max_pool2d
 
 from polarguide.capture import View
 from polarguide.core.progress import Reporter
-from polarguide.geometry.camera import Camera
-from polarguide.geometry.vectors import dot, unit
+from polarguide.geometry.camera import Camera, dot, unit
 from polarguide.raster.surface import WIDTH
 from polarguide.results.rendering.mesh import OPAQUE
 from polarguide.runs.model import GaussianModel

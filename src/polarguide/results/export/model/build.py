@@ -21,9 +21,8 @@ from polarguide.results.export.model.irradiance import WHAT, Surroundings, arriv
 from polarguide.results.export.model.topology import SurfaceView, subject_surface
 from polarguide.results.export.model.unwrap import Texels, Unwrapped, rasterized_texels, unwrap
 from polarguide.results.export.placement import Placement
-from polarguide.results.rendering.mesh import ColoredMesh, Surface, fused_surface, painted
+from polarguide.results.rendering.mesh import ColoredMesh, Inside, Surface, fused_surface, painted
 from polarguide.results.rendering.relight import mirrored_light, needs_radiance
-from polarguide.results.rendering.subject import Inside
 from polarguide.runs.opened import OpenedRun
 from polarguide.shading.cubemap import cubemap_lookup
 from polarguide.shading.deferred import DeferredShading

@@ -24,7 +24,7 @@ from scipy.spatial.transform import Rotation
 from polarguide.core.errors import optional_import
 from polarguide.core.progress import Advance
 from polarguide.gaussians.harmonics import sh_basis
-from polarguide.geometry.vectors import spread_directions
+from polarguide.geometry.camera import spread_directions
 from polarguide.optics import reflectances_from_cosine
 from polarguide.results.export.model.topology import Places
 from polarguide.results.rendering.mesh import ColoredMesh
