@@ -22,7 +22,8 @@ from polarguide.capture.layout import (
     one_of_each_shot,
     shot_stem,
 )
-from polarguide.capture.sensor.pattern import RAW_SUFFIXES, SENSOR_NAMES
+from polarguide.capture.sensor.mosaics import RAW_SUFFIXES
+from polarguide.capture.sensor.pattern import SENSOR_NAMES
 from polarguide.capture.view import ANGLES
 from polarguide.core.errors import PolarguideError, require
 from polarguide.core.text import canonical

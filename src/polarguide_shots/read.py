@@ -16,21 +16,10 @@ from torch import Tensor
 from polarguide import optics
 from polarguide.capture import checks
 from polarguide.capture.brackets import SINGLE, Bracket, bracket_notes
-from polarguide.capture.calibration import UNIT_GAINS, oriented, pair_ratio
+from polarguide.capture.calibration import UNIT_GAINS, apply_orientation, as_displayed, oriented, pair_ratio
 from polarguide.capture.colmap.model import fit_camera, read_model
-from polarguide.capture.develop import (
-    BracketedShots,
-    LinearShots,
-    MosaicFiles,
-    as_displayed,
-    calibration_of,
-    levels_of_shot,
-    pair_gains,
-    sample_blocks,
-)
+from polarguide.capture.develop import BracketedShots, LinearShots, levels_of_shot, moved_shots, pair_gains
 from polarguide.capture.exposures import FOUR, Angle, normalized
-from polarguide.capture.filter.camera_files import apply_orientation
-from polarguide.capture.filter.develop import moved_shots
 from polarguide.capture.filter.encoding import transfer_of_pictures
 from polarguide.capture.filter.shots import _READ, require_four_shots, stacked
 from polarguide.capture.layout import (
@@ -42,6 +31,7 @@ from polarguide.capture.layout import (
     select_views,
 )
 from polarguide.capture.sensor.demosaic import DEMOSAIC_MODES, defects, defects_note, demosaic, spoiled
+from polarguide.capture.sensor.mosaics import MosaicFiles, calibration_of, sample_blocks
 from polarguide.capture.sensor.pattern import (
     SIDE,
     Levels,

@@ -15,18 +15,17 @@ from torch import Tensor
 
 from polarguide.capture import checks
 from polarguide.capture.brackets import Bracket
-from polarguide.capture.calibration import ANGLES, Calibration
+from polarguide.capture.calibration import ANGLES, Calibration, apply_orientation, orientation_calibration
 from polarguide.capture.develop import COMPARABLE, levels_of_shot, require_one, stated_exposures
 from polarguide.capture.exposures import Angle, Exposure, analyzers, turned
-from polarguide.capture.filter.camera_files import apply_orientation, orientation_calibration
 from polarguide.capture.filter.encoding import VIDEO, kind_of_file, transfer_of_pictures
 from polarguide.capture.filter.shots import Shots, read_stack, stacked
-from polarguide.capture.formats.headers import rescaled
 from polarguide.capture.formats.pictures import linear_codes
+from polarguide.capture.formats.stored import require_alike, rescaled
 from polarguide.capture.layout import require_memory
 from polarguide.capture.picture_sets import Mask, SetSamples
 from polarguide.capture.view import FULL_CODE, View
-from polarguide.capture.view_reader import ViewData, require_alike
+from polarguide.capture.view_reader import ViewData
 from polarguide.core.errors import require
 from polarguide_shots.options import ShotOptions
 from polarguide_shots.sets import SetPicture, known_indices, read_frames

@@ -10,20 +10,22 @@ import pytest
 from camera_files import COLOR, MONO, behind, busy_light, mosaic, pack, smooth_light, write_mosaic
 from faults import Fault
 
-from polarguide.capture.develop import sample_blocks
 from polarguide.capture.sensor.demosaic import DEMOSAIC_MODES, DemosaicedPicture, demosaic
-from polarguide.capture.sensor.pattern import (
+from polarguide.capture.sensor.mosaics import (
     PACKINGS,
+    RawFormat,
+    packed_size,
+    read_mosaic,
+    sample_blocks,
+    unpack,
+)
+from polarguide.capture.sensor.pattern import (
     SENSORS,
     SIDE,
     MosaicOptions,
-    RawFormat,
     color_filters,
     estimate_levels,
-    packed_size,
-    read_mosaic,
     sensor_pattern,
-    unpack,
     unusable_samples,
 )
 from polarguide.preparation.prepare import prepare_scene

@@ -24,7 +24,7 @@ from functools import lru_cache
 from pathlib import Path
 
 from polarguide.capture.exposures import FOUR, TABLE, Exposure, Line, read_table
-from polarguide.capture.formats.pictures import SUFFIXES, stated_size
+from polarguide.capture.formats.stored import SUFFIXES, stated_size
 from polarguide.capture.view import ANGLES
 from polarguide.core.errors import PolarguideError, require, unknown_view
 from polarguide.core.files import read_rows, require_folder

@@ -18,7 +18,6 @@ from torch import Tensor
 from polarguide.capture import box_filter as boxes
 from polarguide.capture import checks
 from polarguide.capture.exposures import FOUR, LARGEST, Angle, Exposure, normalized
-from polarguide.capture.formats.headers import declared_size
 from polarguide.capture.formats.pictures import (
     MATERIAL_REMEDY,
     codes_of_floats,
@@ -26,9 +25,9 @@ from polarguide.capture.formats.pictures import (
     decode_materials,
     decode_picture,
     linear_codes,
-    read_picture,
     require_full_scale,
 )
+from polarguide.capture.formats.stored import read_picture, require_alike, require_size
 from polarguide.capture.layout import CaptureFiles
 from polarguide.capture.metadata import GroundTruth, merges_exposures, read_ground_truth
 from polarguide.capture.point_exposures import ComparedPoints, PointExposures, PointSamples
@@ -463,6 +462,7 @@ def view_data(
     """
     height, width = raw[0].shape[:2]
     peak = functools.reduce(np.maximum, [pixels[..., channel] for pixels in raw for channel in range(3)])
+    histogram = np.sum([checks.top_histogram(pixels) for pixels in raw], axis=0)
     if peak.dtype == np.float32:
         peak = linear_codes(peak, transfer)
     return ViewData(
@@ -471,7 +471,7 @@ def view_data(
         codes=_codes(raw, transfer, factor),
         peak=boxes.maximum(peak, factor),
         black=boxes.maximum(np.asarray(peak == 0), factor),
-        histogram=np.sum([checks.top_histogram(pixels) for pixels in raw], axis=0),
+        histogram=histogram,
         invalid=boxes.maximum(np.zeros((height, width), bool) if invalid is None else invalid, factor),
         mask=None if mask is None else boxes.every(mask, factor),
         ground_truth=ground_truth,
@@ -537,49 +537,6 @@ def _read_pictures(files: Files, layout: CaptureFiles, name: str, transfer: str)
         remedy="Remove the option.",
     )
     return pictures
-
-
-def require_size(path: Path, data: bytes, size: Sequence[int], *, like: Path | None = None) -> None:
-    """Refuse a picture of the wrong size by its header, before memory is allocated to decode it.
-
-    Args:
-        path: path of the file.
-        data: content of the file.
-        size: required height and width.
-        like: another file with the required size, which the message names.
-
-    Raises:
-        PolarguideError: the header states another size.
-    """
-    stated = declared_size(data)
-    if stated is not None and stated != (size[1], size[0]):
-        alike = "the size of the pictures" if like is None else f"the size of {'/'.join(like.parts[-2:])}"
-        raise PolarguideError(
-            path,
-            expected=f"{alike}, {size[1]}x{size[0]}",
-            found=f"{stated[0]}x{stated[1]}",
-            remedy="Create it again for these pictures."
-            if like is None
-            else "Export all pictures of a view with the same settings.",
-        )
-
-
-def require_alike(path: Path, picture: NDArray[Any], first_path: Path, first: NDArray[Any]) -> None:
-    """Check that a picture has the same size and bit depth as the first picture of its view.
-
-    Raises:
-        PolarguideError: the size or the bit depth differs.
-    """
-    if (picture.shape, picture.dtype) != (first.shape, first.dtype):
-        own, expected = (
-            f"{p.shape[1]}x{p.shape[0]} with {p.dtype.itemsize * 8} bits" for p in (picture, first)
-        )
-        raise PolarguideError(
-            path,
-            expected=f"{expected} like {'/'.join(first_path.parts[-2:])}",
-            found=own,
-            remedy="Export all pictures of a view with the same settings.",
-        )
 
 
 def _read_optional(

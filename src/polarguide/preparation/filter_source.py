@@ -18,32 +18,35 @@ from numpy.typing import NDArray
 
 from polarguide.capture.angle_evidence import TO_DEVIATION
 from polarguide.capture.brackets import Bracket, MergedExposures, bracket_notes
-from polarguide.capture.calibration import LARGEST_IMBALANCE, pair_ratio
+from polarguide.capture.calibration import (
+    LARGEST_IMBALANCE,
+    apply_orientation,
+    as_displayed,
+    orientation_calibration,
+    pair_ratio,
+)
 from polarguide.capture.colmap.model import read_model
 from polarguide.capture.colmap.poses import Geometry
 from polarguide.capture.develop import (
     COMPARABLE,
     BracketedShots,
     LinearShots,
-    as_displayed,
     exposure_notes,
     levels_of_pictures,
     light_of_files,
     pair_gains,
     require_one,
+    shift_notes,
     stated_exposures,
 )
 from polarguide.capture.exposures import TABLE, Angle, angle_text, turned
 from polarguide.capture.filter.camera_files import (
     Lens,
-    apply_orientation,
     camera_groups,
     is_camera_raw,
     orientation,
-    orientation_calibration,
     stored_frame,
 )
-from polarguide.capture.filter.develop import shift_notes
 from polarguide.capture.filter.encoding import (
     TransferDecision,
     kind_of_file,
@@ -57,7 +60,8 @@ from polarguide.capture.filter.shots import (
     read_stack,
     require_four_shots,
 )
-from polarguide.capture.formats.pictures import decode_mask, decode_picture, read_picture, stated_size
+from polarguide.capture.formats.pictures import decode_mask, decode_picture
+from polarguide.capture.formats.stored import read_picture, stated_size
 from polarguide.capture.layout import all_exposures, exposure_tables, require_memory_of_each
 from polarguide.capture.point_exposures import (
     FEWEST,

@@ -25,31 +25,26 @@ from numpy.typing import NDArray
 
 from polarguide.capture.angle_evidence import OutlineAgreement, outline_agreement, sense_of_outlines
 from polarguide.capture.brackets import Bracket, MergedExposures, Radiance, bracket_notes
-from polarguide.capture.calibration import UNIDENTIFIED, Sense, oriented
+from polarguide.capture.calibration import (
+    INVERSE,
+    QUARTER_TURNS,
+    UNIDENTIFIED,
+    Sense,
+    apply_orientation,
+    oriented,
+)
 from polarguide.capture.colmap.model import PosedCamera
 from polarguide.capture.colmap.poses import Geometry
 from polarguide.capture.datasets.dataset import Dataset, not_as_published, read_mask, resized_mask
-from polarguide.capture.develop import (
-    QUARTER_FLIPS,
-    MosaicFiles,
-    levels_of_capture,
-    pair_gains,
-    sample_blocks,
-)
+from polarguide.capture.develop import levels_of_capture, pair_gains
 from polarguide.capture.exposures import Angle
-from polarguide.capture.filter.camera_files import INVERSE, QUARTER_TURNS, Lens, apply_orientation
-from polarguide.capture.formats.pictures import stated_size
+from polarguide.capture.filter.camera_files import Lens
+from polarguide.capture.formats.stored import stated_size
 from polarguide.capture.layout import all_exposures, exposure_tables, index_shot_files, require_memory_of_each
 from polarguide.capture.raw_options import CameraOptions
 from polarguide.capture.sensor.demosaic import DEMOSAIC_MODES, defects, defects_note, demosaic
-from polarguide.capture.sensor.pattern import (
-    FULL_16,
-    RAW_SUFFIXES,
-    SIDE,
-    Levels,
-    agreed_full_scale,
-    require_kind,
-)
+from polarguide.capture.sensor.mosaics import QUARTER_FLIPS, RAW_SUFFIXES, MosaicFiles, sample_blocks
+from polarguide.capture.sensor.pattern import FULL_16, SIDE, Levels, agreed_full_scale, require_kind
 from polarguide.capture.view import FULL_CODE
 from polarguide.capture.write import EXACT, rounding_of
 from polarguide.core.errors import PolarguideError, PolarguideWarning

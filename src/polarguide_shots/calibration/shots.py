@@ -29,17 +29,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from polarguide.capture.develop import sample_blocks
 from polarguide.capture.layout import describe_contents, index_files
+from polarguide.capture.sensor.mosaics import RAW_SUFFIXES, RawFormat, read_mosaic, sample_blocks
 from polarguide.capture.sensor.pattern import (
-    RAW_SUFFIXES,
     SIDE,
     Levels,
     Pattern,
-    RawFormat,
     agreed_full_scale,
     estimate_levels,
-    read_mosaic,
     require_kind,
     sensor_pattern,
 )

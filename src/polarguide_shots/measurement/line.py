@@ -18,10 +18,9 @@ from typing import Any
 import msgspec
 
 from polarguide.capture.exposures import Angle
-from polarguide.capture.formats.headers import find_damage
-from polarguide.capture.formats.pictures import SUFFIXES
+from polarguide.capture.formats.stored import SUFFIXES, find_damage
 from polarguide.capture.layout import is_lone_exposure
-from polarguide.capture.sensor.pattern import RAW_SUFFIXES
+from polarguide.capture.sensor.mosaics import RAW_SUFFIXES
 from polarguide.capture.view import ANGLES
 from polarguide.capture.view_reader import Array
 from polarguide.core.errors import PolarguideError, require

@@ -25,7 +25,8 @@ from numpy.typing import NDArray
 from polarguide.capture.colmap import steps
 from polarguide.capture.colmap.model import PosedCamera, colmap_camera, load_model, posed_model
 from polarguide.capture.filter.camera_files import Lens
-from polarguide.capture.formats.pictures import decode_mask, decode_picture, read_picture
+from polarguide.capture.formats.pictures import decode_mask, decode_picture
+from polarguide.capture.formats.stored import read_picture
 from polarguide.capture.write import write_png_file
 from polarguide.core.errors import PolarguideError, require
 from polarguide.core.files import make_folder, write_whole, writing

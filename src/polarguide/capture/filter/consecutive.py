@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polarguide.capture.filter.camera_files import is_camera_raw, read_camera_raw
-from polarguide.capture.formats.pictures import decode_picture, read_picture
+from polarguide.capture.formats.pictures import decode_picture
+from polarguide.capture.formats.stored import read_picture
 from polarguide.capture.write import write_png_file
 from polarguide.core.errors import require
 from polarguide.core.files import make_folder, write_text

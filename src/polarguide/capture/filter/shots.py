@@ -25,8 +25,8 @@ from polarguide.capture.exposures import (
     read_table,
 )
 from polarguide.capture.filter.camera_files import CAMERA_RAW, is_camera_raw, orientation, read_camera_raw
-from polarguide.capture.formats.headers import rescaled
-from polarguide.capture.formats.pictures import SUFFIXES, decode_picture, is_lossy, read_picture
+from polarguide.capture.formats.pictures import decode_picture
+from polarguide.capture.formats.stored import SUFFIXES, is_lossy, read_picture, require_alike, rescaled
 from polarguide.capture.layout import (
     ambiguous,
     angle_folders,
@@ -35,9 +35,9 @@ from polarguide.capture.layout import (
     require_angle_folders,
     shot_stem,
 )
-from polarguide.capture.sensor.pattern import RAW_SUFFIXES, Levels
+from polarguide.capture.sensor.mosaics import RAW_SUFFIXES
+from polarguide.capture.sensor.pattern import Levels
 from polarguide.capture.view import ANGLES
-from polarguide.capture.view_reader import require_alike
 from polarguide.core.errors import PolarguideError, require
 from polarguide.core.text import canonical, listed
 
