@@ -10,7 +10,7 @@ from pathlib import Path
 
 from polarguide.capture.exposures import TABLE
 from polarguide.capture.filter import shots as filter_shots
-from polarguide.capture.filter.consecutive import VIDEO_SUFFIXES
+from polarguide.capture.filter.shots import VIDEO_SUFFIXES
 from polarguide.capture.layout import (
     CaptureFiles,
     angle_folders,

@@ -27,9 +27,9 @@ from polarguide.capture.exposures import (
     normalized,
     parse_angle,
 )
-from polarguide.capture.filter.consecutive import VIDEO_SUFFIXES
 from polarguide.capture.filter.shots import (
     SHOT_SUFFIXES,
+    VIDEO_SUFFIXES,
     angle_order,
     group_files,
     listed_pictures,

@@ -2,6 +2,8 @@
 
 Camera axes are the axes of OpenCV: x right, y down, z forward. A pose maps world to camera coordinates, ``x_cam = R
     x_world + t``. The center of the top-left pixel is at (0.5, 0.5), as in COLMAP.
+
+Products of vectors are written component by component, because PyTorch's reductions over three values are slow.
 """
 
 from __future__ import annotations

@@ -17,12 +17,13 @@ from polarguide.capture.colmap.model import holds_model, view_of_name
 from polarguide.capture.colmap.poses import Poses
 from polarguide.capture.datasets.readers import PISR_SENSOR, detect_dataset, open_dataset
 from polarguide.capture.exposures import TABLE, angles_of_names, folders_of_angles, parse_angle
-from polarguide.capture.filter.consecutive import (
+from polarguide.capture.filter.shots import (
+    SHOT_SUFFIXES,
     extract_frames,
+    find_shots,
     find_videos,
     shots_of_one_place,
 )
-from polarguide.capture.filter.shots import SHOT_SUFFIXES, find_shots
 from polarguide.capture.formats.pictures import decode_picture
 from polarguide.capture.formats.stored import SUFFIXES, read_picture
 from polarguide.capture.layout import (

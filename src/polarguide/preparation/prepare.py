@@ -26,7 +26,7 @@ from polarguide.capture.calibration import TURNS
 from polarguide.capture.colmap.model import read_model
 from polarguide.capture.colmap.poses import Geometry, Poses
 from polarguide.capture.colmap.sfm import LEAST_VIEWS, NotConnectedError, add_points, reconstruct, tone_mapped
-from polarguide.capture.filter.consecutive import chosen_matching
+from polarguide.capture.filter.shots import chosen_matching
 from polarguide.capture.raw_options import SampledOptions, changed
 from polarguide.capture.sensor.pattern import MosaicOptions
 from polarguide.capture.view import ANGLES, listed

@@ -17,12 +17,12 @@ from polarguide.raster.magnification import footprints
 from polarguide.shading.gbuffer import RenderRequest, render, splats
 from polarguide.shading.model import Parameters, ShadingModel
 from polarguide.training.callback import AnyCallback, Callback
+from polarguide.training.context import TrainingState, seeded
 from polarguide.training.loop import TrainingLoop
 from polarguide.training.metals.observations import index_offsets
 from polarguide.training.metals.search import MetalSearch
 from polarguide.training.recipe import Position, Propagation
 from polarguide.training.settings import StepReport
-from polarguide.training.state import TrainingState, seeded
 from polarguide.training.targets import Step
 
 

@@ -37,7 +37,6 @@ from polarguide.runs.train import Ends, Look
 from polarguide.shading.model import ShadingModel
 from polarguide.training.loop import TrainingLoop
 from polarguide.viewer.guard import Accepts, Gate, checked_message, guarded
-from polarguide.viewer.panel import PanelOptions
 from polarguide.viewer.scenery import (
     UNCHANGED,
     Photograph,
@@ -46,7 +45,7 @@ from polarguide.viewer.scenery import (
     run_scenery,
     training_scenery,
 )
-from polarguide.viewer.session import Session
+from polarguide.viewer.session import PanelOptions, Session
 
 REFRESH = 1.0  # least time in seconds between two pictures of a training
 SHARE = 10.0  # least time in units of the duration of the last picture

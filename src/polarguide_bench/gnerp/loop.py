@@ -17,8 +17,8 @@ from polarguide.geometry.camera import Camera, dot, unit
 from polarguide.optics import aolp, dolp, lens_frame, luminance
 from polarguide.optics.color import srgb_encode
 from polarguide.training.callback import Loop
+from polarguide.training.context import seeded
 from polarguide.training.settings import ResolvedSettings
-from polarguide.training.state import seeded
 from polarguide.training.storage import Entry, Packed, ViewStore, packed, stored_values
 from polarguide_bench.gnerp.march import RaySamples, march
 from polarguide_bench.gnerp.recipe import NeuralRecipe

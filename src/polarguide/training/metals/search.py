@@ -54,7 +54,7 @@ from polarguide.raster import Rasterize
 from polarguide.shading.gbuffer import render
 from polarguide.shading.metal import FIRST_REFLECTANCE, become_metal
 from polarguide.shading.model import Light, Parameters, ShadingModel
-from polarguide.training.context import TrainingContext
+from polarguide.training.context import TrainingContext, TrainingState
 from polarguide.training.metals.observations import (
     LEAST_PIXELS,
     ViewSamples,
@@ -67,7 +67,6 @@ from polarguide.training.metals.observations import (
 )
 from polarguide.training.recipe import MetalRules, MetalViews, Recipe, Schedule
 from polarguide.training.settings import ResolvedSettings
-from polarguide.training.state import TrainingState
 
 ROUGH = (1.0, 0.85, 0.7, 0.55)
 """Tested shares of the specular polarization that remain on a rough dielectric."""

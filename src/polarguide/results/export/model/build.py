@@ -15,9 +15,17 @@ from polarguide.core.errors import PolarguideError, require_package
 from polarguide.core.options import BaseColor, ModelOptions
 from polarguide.core.progress import Reporter
 from polarguide.core.system import free_memory
-from polarguide.results.export.model.bake import Baked, ColorSource, bake
+from polarguide.results.export.model.bake import (
+    WHAT,
+    Baked,
+    ColorSource,
+    Surroundings,
+    arriving_light,
+    bake,
+    delit,
+    irradiance,
+)
 from polarguide.results.export.model.gltf import Textured, color_pixels, linear_pixels
-from polarguide.results.export.model.irradiance import WHAT, Surroundings, arriving_light, delit, irradiance
 from polarguide.results.export.model.topology import SurfaceView, subject_surface
 from polarguide.results.export.model.unwrap import Texels, Unwrapped, rasterized_texels, unwrap
 from polarguide.results.export.placement import Placement
