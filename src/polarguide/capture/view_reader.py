@@ -462,7 +462,6 @@ def view_data(
     """
     height, width = raw[0].shape[:2]
     peak = functools.reduce(np.maximum, [pixels[..., channel] for pixels in raw for channel in range(3)])
-    histogram = np.sum([checks.top_histogram(pixels) for pixels in raw], axis=0)
     if peak.dtype == np.float32:
         peak = linear_codes(peak, transfer)
     return ViewData(
@@ -471,7 +470,7 @@ def view_data(
         codes=_codes(raw, transfer, factor),
         peak=boxes.maximum(peak, factor),
         black=boxes.maximum(np.asarray(peak == 0), factor),
-        histogram=histogram,
+        histogram=np.sum([checks.top_histogram(pixels) for pixels in raw], axis=0),
         invalid=boxes.maximum(np.zeros((height, width), bool) if invalid is None else invalid, factor),
         mask=None if mask is None else boxes.every(mask, factor),
         ground_truth=ground_truth,
