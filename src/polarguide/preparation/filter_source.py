@@ -223,11 +223,8 @@ class ShotsSource(Source):
         """Return the path of a photograph relative to the folder of the capture."""
         return path.relative_to(self._root).as_posix()
 
-    def _linear(self, view: str, measured: ShotsMeasured, *, align: bool) -> LinearShots:
-        """Return the linear shots of a view. They are aligned if ``align`` is True."""
-        return self._merged(view, measured.levels, measured.transfer, align=align)
-
     def _merged(self, view: str, levels: Levels | None, transfer: str, *, align: bool) -> LinearShots:
+        """Return the linear shots of a view. They are aligned if ``align`` is True."""
         read = BracketedShots.read(self._of_view[view], levels)
         if self.used_as_stored(view):
             read = replace(read, shots=[replace(shots, orientation=1) for shots in read.shots])
@@ -338,7 +335,7 @@ class FilterSource(ShotsSource):
         angles, rotate for display.
         """
         settings = self._settings
-        shots = self._linear(view, measured, align=settings.align)
+        shots = self._merged(view, measured.levels, measured.transfer, align=settings.align)
         paths = self._of_view[view]
         stated = [measured.light.get(self._name(path), 1.0) for path in paths]
         linear, exposures, warning = shots.evenly_exposed([path.name for path in paths], stated, settings)
@@ -451,7 +448,7 @@ class SinglesSource(ShotsSource):
         settings = self._settings
         singles = self._singles[view]
         usual = [shot.angle for shot in singles] == list(ANGLES)
-        shots = self._linear(view, measured, align=settings.align and usual)
+        shots = self._merged(view, measured.levels, measured.transfer, align=settings.align and usual)
         turn = orientation_calibration(shots.orientation)
         angles = [turned(turned(shot.angle, settings.calibration), turn) for shot in singles]
         exposures = [
