@@ -27,7 +27,7 @@ from polarguide.capture.formats.pictures import (
     linear_codes,
     require_full_scale,
 )
-from polarguide.capture.formats.stored import read_picture, require_alike, require_size
+from polarguide.capture.formats.stored import declared_size, read_picture, require_alike, require_size
 from polarguide.capture.layout import CaptureFiles
 from polarguide.capture.metadata import GroundTruth, merges_exposures, read_ground_truth
 from polarguide.capture.point_exposures import ComparedPoints, PointExposures, PointSamples
@@ -511,15 +511,16 @@ def _read_pictures(files: Files, layout: CaptureFiles, name: str, transfer: str)
     whose largest value marks saturated pixels. The median may exceed 1 only if ``prepare`` merged exposures.
     """
     paths = layout.files(name)
-    pictures: list[NDArray[Any]] = []
-    for path in paths:
-        data = files.picture(path)
-        if pictures:
-            require_size(path, data, pictures[0].shape[:2], like=paths[0])
-        picture = decode_picture(path, data, keep_floats=True)
-        if pictures:
-            require_alike(path, picture, paths[0], pictures[0])
-        pictures.append(picture)
+    contents = [files.picture(path) for path in paths]
+    size = declared_size(contents[0])
+    for path, data in zip(paths, contents, strict=True):
+        if size is not None:
+            require_size(path, data, size[::-1], like=paths[0])
+    pictures = [
+        decode_picture(path, data, keep_floats=True) for path, data in zip(paths, contents, strict=True)
+    ]
+    for path, picture in zip(paths, pictures, strict=True):
+        require_alike(path, picture, paths[0], pictures[0])
     if pictures[0].dtype != np.float32:
         return pictures
     if all(picture.max() <= 1 for picture in pictures):
