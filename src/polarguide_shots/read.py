@@ -18,7 +18,7 @@ from polarguide.capture import checks
 from polarguide.capture.brackets import SINGLE, Bracket, bracket_notes
 from polarguide.capture.calibration import UNIT_GAINS, apply_orientation, as_displayed, oriented, pair_ratio
 from polarguide.capture.colmap.model import fit_camera, read_model
-from polarguide.capture.develop import BracketedShots, LinearShots, levels_of_shot, moved_shots, pair_gains
+from polarguide.capture.develop import BracketedShots, LinearShots, moved_shots, pair_gains
 from polarguide.capture.exposures import FOUR, Angle, normalized
 from polarguide.capture.filter.encoding import transfer_of_pictures
 from polarguide.capture.filter.shots import _READ, require_four_shots, stacked
@@ -69,6 +69,7 @@ from polarguide_shots.options import ShotOptions
 from polarguide_shots.samples import (
     SetSamples,
     behind_lens,
+    levels_of_shot,
     read_set,
     samples_of_arrays,
     samples_of_loaded,

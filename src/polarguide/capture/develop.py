@@ -481,48 +481,6 @@ def levels_of_capture(
     return levels, level_notes(levels, counts, container, options.bits, stated)
 
 
-def levels_of_shot(
-    values: NDArray[Any],
-    container: int,
-    options: SampledOptions,
-    *,
-    bits: int | None,
-    black: float = 0.0,
-    stated: int | None = None,
-) -> tuple[Levels, list[str]]:
-    """Estimate the levels (such as full scale) of the stored values of a single shot.
-
-    If many samples have the same largest value, they are saturated. This value does not become the full scale, because
-    all shots of a series must have the same full scale.
-
-    Args:
-        values: stored values, [K, ...].
-        container: see ``levels_of_capture``.
-        options: see ``levels_of_capture``.
-        bits: number of bits of a sensor value, or None if it is unknown.
-        black: see ``levels_of_capture``.
-        stated: see ``levels_of_capture``.
-
-    Returns:
-        The levels, and notes for the user.
-
-    Raises:
-        PolarguideError: a value exceeds ``--bits``, or ``--saturation`` is out of range.
-    """
-    largest = int(values.max())
-    counts = None
-    # Clipped values are a power of two minus 1. This test avoids the slow counting of all values.
-    may_pile_up = container == 16 and largest < FULL_16 and largest & (largest + 1) == 0
-    if may_pile_up and options.bits is None and options.saturation is None:
-        parts = (np.bincount(part.ravel(), minlength=FULL_16 + 1) for part in values)
-        counts = sum(parts, np.zeros(1, np.int64))
-    levels = estimate_levels(
-        largest, int(np.bitwise_or.reduce(values, None)), container,
-        bits=bits, black=black, saturation=options.saturation, counts=counts, stated=stated, alone=True,
-    )  # fmt: skip
-    return levels, level_notes(levels, counts, container, bits, stated)
-
-
 def levels_of_pictures(paths: Sequence[Path], options: SampledOptions) -> tuple[Levels | None, list[str]]:
     """Estimate the levels (such as full scale) of the stored values of all pictures of a capture.
 
