@@ -68,6 +68,7 @@ from polarguide.inspection.shots import (
     estimate_shot_angles,
     pictures_check,
     shot_checks,
+    strong_polarization,
 )
 from polarguide.raster import Backend
 from polarguide.visualization import figures
@@ -556,7 +557,7 @@ def inspect_scene(
         checks += [pose_check(capture), lens_check(capture), coverage_check(capture), held_out_check(capture)]
     angles, pixels = _angles(capture, settings, index, pairing or 0, backend, reporter)
     angles = with_noise(angles, measurements)
-    checks += [*angle_checks(angles), dielectric_check(measurements, pixels, index)]
+    checks += [*angle_checks(angles), dielectric_check([r.above_limit for r in measurements], pixels, index)]
     return Inspection(capture, settings, index, tuple(measurements), tuple(checks), angles)
 
 
@@ -587,7 +588,9 @@ def _shots(
                 backend=backend,
                 on_step=lambda report: advance(min(report.step + 1, settings.steps)),
             )
-    return checks + shot_checks(findings), findings
+    strong = strong_polarization(capture, index)
+    last = [dielectric_check(strong, None, index)] if strong else []
+    return [*checks, *shot_checks(findings), *last], findings
 
 
 def _angles(

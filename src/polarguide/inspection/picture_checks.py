@@ -403,11 +403,15 @@ def analyzer_check(capture: Capture) -> Check | None:
     return Check("analyzers", "ok", f"Prepared with {name}.", figures=analyzers)
 
 
-def dielectric_check(
-    measurements: Sequence[ViewMeasurements], pixels: SurfaceSamples | None, index: float
-) -> Check:
-    """Check that large areas are not polarized more strongly than a dielectric under unpolarized light can be."""
-    share = float(torch.tensor([r.above_limit for r in measurements]).median())
+def dielectric_check(shares: Sequence[float], pixels: SurfaceSamples | None, index: float) -> Check:
+    """Check that large areas are not polarized more strongly than a dielectric under unpolarized light can be.
+
+    Args:
+        shares: share of pixels of each view whose DoLP exceeds the limit of diffuse light.
+        pixels: pixels with normals, or None.
+        index: refractive index.
+    """
+    share = float(torch.tensor(shares).median())
     limit = float(optics.diffuse_dolp_limit(index))
     finding = f"{share:.0%} of the pixels (median view) have a DoLP above the diffuse limit ({limit:.2f}). "
     figures = {"above_diffuse_limit": share}

@@ -81,7 +81,7 @@ class TrainingContext:
     @cached_property
     def shading(self) -> ShadingModel:
         """Shading model of the recipe with the refractive index of the settings."""
-        return self.recipe.shading.bind(self.settings.refractive_index)
+        return replace(self.recipe.shading, refractive_index=self.settings.refractive_index)
 
     @property
     def black(self) -> bool:
