@@ -28,10 +28,9 @@ from polarguide.raster.cuda import has_gsplat
 from polarguide.results.evaluation.metrics import psnr
 from polarguide.runs.folder import CHECKPOINT, load_checkpoint, resolve, save_checkpoint
 from polarguide.shading.gbuffer import render
-from polarguide.training.angles.fits import gaussian_training
-from polarguide.training.context import TrainingContext
+from polarguide.training.angles.polarizers import gaussian_training
+from polarguide.training.context import TrainingContext, TrainingState
 from polarguide.training.settings import TrainSettings
-from polarguide.training.state import TrainingState
 
 RECIPE = RECIPES["polarguide"]
 
@@ -97,7 +96,7 @@ def train_on(job: Job, name: str, steps: int, folder: Path) -> dict[str, Any]:
 @torch.no_grad()
 def mean_psnr(scene: Scene, state: TrainingState, backend: Backend) -> float:
     """Return the mean over the test views, in decibels."""
-    shading, values = RECIPE.shading.bind(1.5), []
+    shading, values = RECIPE.shading, []
     for view in scene.test_views:
         picture = render(
             state.gaussians, view.camera, backend.rasterize, shading=shading, light=state.light

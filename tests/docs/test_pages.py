@@ -19,7 +19,7 @@ SOURCES = ROOT / "src"
 PACKAGE = SOURCES / "polarguide"
 GENERATED = (DOCS / "generated", DOCS / "reference" / "api")
 PAGES = sorted(p for p in DOCS.rglob("*.md") if not any(made in p.parents for made in GENERATED))
-BESIDE = ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "research/trials.md")
+BESIDE = ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "research/trials.md", "research/unknown.md")
 TEXTS = [*PAGES, *(ROOT / name for name in BESIDE)]
 
 FENCE = re.compile(r"^```(\w*)[^\n]*\n(.*?)^```", re.MULTILINE | re.DOTALL)

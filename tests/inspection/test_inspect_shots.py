@@ -6,6 +6,7 @@ import dataclasses
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 from browsers import chromium
 from reduced_demo import VIEWS
@@ -73,6 +74,32 @@ def test_pictures_of_a_view_that_contradict_one_another(tmp_path: Path, wrong: i
     found = polarguide.inspect(tmp_path / "scene", tmp_path / "out", device="cpu").check("agreement")
     assert (found.verdict, found.views) == (("wrong", ("cup",)) if wrong else ("ok", ()))
     assert ("(100 degrees) looks like 112 degrees" in found.finding) == bool(wrong)
+
+
+@pytest.mark.parametrize("angles", [(0, 60, 120), (10, 40, 70, 100, 130, 160)], ids=["three", "six"])
+@pytest.mark.parametrize(("factor", "verdict"), [(0.5, "ok"), (1.6, "warning")])
+def test_sets_that_are_polarized_more_than_a_dielectric(
+    tmp_path: Path, angles: tuple[int, ...], factor: float, verdict: str
+) -> None:
+    stokes = sphere() * np.array([1, factor, factor])[:, None, None]
+    true_share = float(np.mean(np.hypot(stokes[1], stokes[2]) > 1.25 / 3.25 * stokes[0]))
+    for noisy in (False, True):
+        folder = tmp_path / str(noisy)
+        pictures = photographed(stokes, angles, noisy=noisy)
+        write_set(folder / "in", [f"cup_a{angle}.png" for angle in angles], pictures)
+        prepare_scene(folder / "in", folder / "scene", PrepareSettings(poses="none", transfer="linear"))
+        check = polarguide.inspect(folder / "scene", folder / "out", device="cpu").check("dielectric")
+        assert check.verdict == verdict
+        # Three standard deviations of the noise leave out some pixels.
+        assert check.figures["above_diffuse_limit"] == pytest.approx(true_share, abs=0.06 if noisy else 0.01)
+
+
+def test_sets_at_unknown_angles_have_no_check_of_polarized_light(tmp_path: Path) -> None:
+    write_set(tmp_path / "in", [f"cup_{n}.png" for n in range(4)], photographed(sphere(), (0, 40, 70, 100)))
+    settings = PrepareSettings(poses="none", transfer="linear", angles="unknown", shots_per_view=4)
+    prepare_scene(tmp_path / "in", tmp_path / "scene", settings)
+    found = polarguide.inspect(tmp_path / "scene", tmp_path / "out", device="cpu")
+    assert "dielectric" not in {check.key for check in found.checks}
 
 
 def test_the_other_sense() -> None:

@@ -7,12 +7,13 @@ A short training without the stated angles estimates the angle of each picture i
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
+from polarguide import optics
 from polarguide.capture import Scene
 from polarguide.capture.angle_evidence import (
     AngleEstimate,
@@ -22,9 +23,9 @@ from polarguide.capture.angle_evidence import (
     tolerance,
 )
 from polarguide.capture.exposures import Exposure, determine_stokes
-from polarguide.capture.picture_sets import SetSamples, chosen_pixels, judge
+from polarguide.capture.picture_sets import SetSamples, chosen_pixels, judge, typical_variance
 from polarguide.capture.view import FULL_CODE, View, listed
-from polarguide.inspection.capture import Capture
+from polarguide.inspection.capture import MEASURABLE, Capture
 from polarguide.inspection.evidence import short_run, training_recipe
 from polarguide.inspection.settings import LCD_TEST, Check, Verdict, first_outcome
 from polarguide.raster import Backend
@@ -214,6 +215,58 @@ def pictures_check(capture: Capture) -> Check:
     return Check("pictures", *outcome, figures=figures)
 
 
+def determined_sets(capture: Capture) -> Iterator[tuple[str, SetSamples]]:
+    """Yield the name and the samples of each view whose known angles determine Stokes vectors."""
+    for view in capture.views:
+        places = [k for k, exposure in enumerate(view.exposures) if exposure.angle is not None]
+        exposures = tuple(view.exposures[k] for k in places)
+        if not determine_stokes(exposures):
+            continue
+        files = capture.layout.files(view.name)
+        yield (
+            view.name,
+            SetSamples(
+                labels=tuple(files[k].name for k in places),
+                values=view.intensities()[places].numpy(),
+                exposures=exposures,
+                lost=np.broadcast_to(view.saturated.numpy(), (len(places), *view.saturated.shape)),
+                dark=view.black.numpy(),
+                masked=view.invalid.numpy(),
+                step=1 / FULL_CODE,
+            ),
+        )
+
+
+def strong_polarization(capture: Capture, index: float) -> list[float]:
+    """Return the share of pixels with a DoLP above the limit of diffuse light, for each of ``determined_sets``.
+
+    The DoLP has to exceed the limit by three times its noise, which is the residual of the fit. Three pictures have no
+    residual. Dark pixels, see ``MEASURABLE``, do not count.
+
+    Args:
+        capture: the capture.
+        index: refractive index.
+    """
+    limit = float(optics.diffuse_dolp_limit(index))
+    shares = []
+    for _, samples in determined_sets(capture):
+        gray = samples.gray(chosen_pixels(samples)).astype(np.float64)
+        gray = gray[:, gray.mean(axis=0) >= MEASURABLE]
+        if not gray.shape[1]:
+            continue
+        inverse = np.linalg.pinv(samples.rows.astype(np.float64))
+        s0, s1, s2 = inverse @ gray
+        squares = ((gray - samples.rows @ np.stack([s0, s1, s2])) ** 2).sum(axis=0)
+        freedom = len(gray) - 3
+        noise = (
+            math.sqrt(typical_variance(squares, freedom) * float((inverse[1:] ** 2).sum()) / 2)
+            if freedom
+            else 0.0
+        )
+        shares.append(float(np.mean(np.hypot(s1, s2) - 3 * noise > limit * s0)))
+    return shares
+
+
 def agreement_checks(capture: Capture) -> list[Check]:
     """Check that the pictures of a view agree with each other.
 
@@ -222,26 +275,14 @@ def agreement_checks(capture: Capture) -> list[Check]:
     compared = 0
     notes = []
     wrong: list[str] = []
-    for view in capture.views:
-        places = [k for k, exposure in enumerate(view.exposures) if exposure.angle is not None]
-        exposures = tuple(view.exposures[k] for k in places)
-        if len(places) < ShotLimits.redundant or not determine_stokes(exposures):
+    for name, samples in determined_sets(capture):
+        if len(samples.labels) < ShotLimits.redundant:
             continue
-        files = capture.layout.files(view.name)
-        samples = SetSamples(
-            labels=tuple(files[k].name for k in places),
-            values=view.intensities()[places].numpy(),
-            exposures=exposures,
-            lost=np.broadcast_to(view.saturated.numpy(), (len(places), *view.saturated.shape)),
-            dark=view.black.numpy(),
-            masked=view.invalid.numpy(),
-            step=1 / FULL_CODE,
-        )
         compared += 1
         judgment = judge(samples, samples.gray(chosen_pixels(samples)).astype(np.float64))
         if judgment.notes:
-            wrong.append(view.name)
-            notes += [f"{view.name}: {note.removesuffix(' It is left out.')}" for note in judgment.notes]
+            wrong.append(name)
+            notes += [f"{name}: {note.removesuffix(' It is left out.')}" for note in judgment.notes]
     if not compared:
         return []
     outcome = first_outcome(

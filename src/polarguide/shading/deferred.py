@@ -10,8 +10,7 @@ import torch
 from torch import Tensor
 
 from polarguide.core.native import fits
-from polarguide.geometry.camera import Camera
-from polarguide.geometry.vectors import dot, unit
+from polarguide.geometry.camera import Camera, dot, unit
 from polarguide.optics import reflectances_from_cosine
 from polarguide.shading.cubemap import cubemap_lookup, mip_lookup
 from polarguide.shading.metal import (
@@ -162,7 +161,9 @@ class DeferredShading(ShadingModel):
     def light_parameters(self) -> Mapping[str, Parameter]:
         """Raw ``texels`` [6, R, R, 3] of the environment."""
         side = self.environment_resolution
-        return {"texels": Parameter((6, side, side, 3), self.environment_rate)}
+        note = LOCAL_NOTE if self.local else ""
+        radiance = RadianceCubemap("texels", self.radiance, self.raw_texels, note)
+        return {"texels": Parameter((6, side, side, 3), self.environment_rate, radiance=radiance)}
 
     def initialize(
         self, colors: Tensor, far: Tensor, generator: torch.Generator
@@ -189,11 +190,6 @@ class DeferredShading(ShadingModel):
         if self.blend == "lerp":
             return torch.logit(radiance.clamp(_NO_LIGHT, 1 - _NO_LIGHT))
         return torch.log(radiance.clamp(min=_NO_LIGHT)).clamp(max=MAXIMUM_LOG_LIGHT)
-
-    @property
-    def radiance_cubemap(self) -> RadianceCubemap | None:
-        """Radiance of the texels."""
-        return RadianceCubemap("texels", self.radiance, self.raw_texels, LOCAL_NOTE if self.local else "")
 
     def light_levels(self, texels: Tensor, *, rough: bool) -> list[Tensor]:
         """Return the levels of light that the look-up needs.

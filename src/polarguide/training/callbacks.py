@@ -10,20 +10,20 @@ import torch
 from torch import Tensor
 
 from polarguide.capture import View
+from polarguide.core.errors import require
 from polarguide.gaussians.densify import DensityStatistics, densify, free_space
-from polarguide.geometry.camera import Camera, seen_at
-from polarguide.geometry.vectors import unit
+from polarguide.geometry.camera import Camera, seen_at, unit
 from polarguide.raster import Rasterize
 from polarguide.raster.magnification import footprints
 from polarguide.shading.gbuffer import RenderRequest, render, splats
 from polarguide.shading.model import Parameters, ShadingModel
 from polarguide.training.callback import AnyCallback, Callback
+from polarguide.training.context import TrainingState, seeded
 from polarguide.training.loop import TrainingLoop
 from polarguide.training.metals.observations import index_offsets
 from polarguide.training.metals.search import MetalSearch
 from polarguide.training.recipe import Position, Propagation
 from polarguide.training.settings import StepReport
-from polarguide.training.state import TrainingState, seeded
 from polarguide.training.targets import Step
 
 
@@ -59,7 +59,15 @@ def propagate_normals(
     their color alone. Glossy Gaussians grow along their surface.
     """
     gaussians = state.gaussians
-    strength = shading.strength(gaussians)
+    strengths = [row for row in shading.surface if row.name == "strength"]
+    require(
+        strengths,
+        "recipe",
+        expected="a shading model with a reflection strength",
+        found=type(shading).__name__,
+        remedy='Remove the action "propagate_normals" from the recipe, or add a surface property "strength".',
+    )
+    strength = strengths[0].values(gaussians)
     gaussians.overwrite("opacity_logits", gaussians["opacity_logits"].clamp(min=_logit(settings.opacity)))
     # The noise is drawn on the CPU, so that it is the same on every device.
     noise = (torch.rand(gaussians["sh_dc"].shape, generator=generator) * 2 - 1) * settings.color_noise
@@ -306,7 +314,8 @@ class DensityControl(Callback[TrainingLoop]):
         return {"gradient": self._statistics.gradient, "seen": self._statistics.seen}
 
     def load_state_dict(self, tensors: Mapping[str, Tensor]) -> None:
-        self._statistics = DensityStatistics.of(tensors["gradient"], tensors["seen"])
+        self._statistics.gradient = tensors["gradient"]
+        self._statistics.seen = tensors["seen"]
 
     def _prune_untouched(self, loop: TrainingLoop) -> None:
         """Remove Gaussians that contribute too little to the training views.

@@ -34,13 +34,18 @@ from polarguide.geometry.scene_frame import scene_frame
 from polarguide.runs.model import layers_of
 from polarguide.runs.opened import OpenedRun
 from polarguide.runs.train import Ends, Look
-from polarguide.shading.model import ShadingModel
+from polarguide.shading.model import ShadingModel, radiance_cubemap
 from polarguide.training.loop import TrainingLoop
-from polarguide.viewer.cameras import Photograph, photographs
 from polarguide.viewer.guard import Accepts, Gate, checked_message, guarded
-from polarguide.viewer.panel import PanelOptions
-from polarguide.viewer.scenery import UNCHANGED, Scenery, run_scenery, training_scenery
-from polarguide.viewer.session import Session
+from polarguide.viewer.scenery import (
+    UNCHANGED,
+    Photograph,
+    Scenery,
+    photographs,
+    run_scenery,
+    training_scenery,
+)
+from polarguide.viewer.session import PanelOptions, Session
 
 REFRESH = 1.0  # least time in seconds between two pictures of a training
 SHARE = 10.0  # least time in units of the duration of the last picture
@@ -104,7 +109,7 @@ class Viewer:
         self._photographs = photographs
         self._beside = beside
         self._scene_frame = scene_frame([photograph.view.camera for photograph in photographs.values()])
-        turns = shading.radiance_cubemap is not None
+        turns = radiance_cubemap(shading) is not None
         others = visitors.allow_host or visitors.allow_origin
         self._save = save if host in LOOPBACK and not others else None
         saves = self._save is not None

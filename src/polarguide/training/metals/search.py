@@ -48,13 +48,13 @@ from polarguide.core.system import UNBOUNDED, MemoryBound
 from polarguide.gaussians.gaussians import Gaussians
 from polarguide.gaussians.geometry import shortest_axis_normals
 from polarguide.gaussians.initialize import far_away
-from polarguide.geometry.vectors import dot
+from polarguide.geometry.camera import dot
 from polarguide.optics.fresnel import reflectances_from_cosine
 from polarguide.raster import Rasterize
 from polarguide.shading.gbuffer import render
 from polarguide.shading.metal import FIRST_REFLECTANCE, become_metal
-from polarguide.shading.model import Light, Parameters, ShadingModel
-from polarguide.training.context import TrainingContext
+from polarguide.shading.model import Light, Parameters, ShadingModel, radiance_cubemap
+from polarguide.training.context import TrainingContext, TrainingState
 from polarguide.training.metals.observations import (
     LEAST_PIXELS,
     ViewSamples,
@@ -67,7 +67,6 @@ from polarguide.training.metals.observations import (
 )
 from polarguide.training.recipe import MetalRules, MetalViews, Recipe, Schedule
 from polarguide.training.settings import ResolvedSettings
-from polarguide.training.state import TrainingState
 
 ROUGH = (1.0, 0.85, 0.7, 0.55)
 """Tested shares of the specular polarization that remain on a rough dielectric."""
@@ -188,7 +187,7 @@ def evidence(
         none = labels.new_zeros(len(labels))
         gray = labels.new_full((len(labels), 3), FIRST_REFLECTANCE)
         return MetalEvidence(none, none, gray, torch.zeros_like(gray), labels)
-    looks = view_sums(gaussians, memory.between(measured), rasterize, limits)
+    looks = [view_sums(gaussians, view, rasterize, limits.least_normal) for view in memory.between(measured)]
     result = of_views(looks, labels, refractive_index, rules, limits)
     del looks
     memory.clear()
@@ -391,11 +390,9 @@ def light_gain(
     ratio = torch.cat(ratios) if ratios else gaussians["means"].new_zeros(0)
     if not len(ratio) or len(ratio) < limits.gain_pixels * pixels:
         return 1.0
-    body = gaussians["metalness"] == 0
-    smallest = (
-        torch.quantile(shading.strength(gaussians)[body], 0.9) if bool(body.any()) else ratio.new_tensor(0.1)
-    )
-    return float(ratio.median().exp().clamp(min=float(smallest), max=limits.most_gain))
+    strengths = torch.sigmoid(gaussians["strength_logits"])[gaussians["metalness"] == 0]
+    smallest = float(torch.quantile(strengths, 0.9)) if len(strengths) else 0.1
+    return float(ratio.median().exp().clamp(min=smallest, max=limits.most_gain))
 
 
 class MetalSearch:
@@ -436,7 +433,7 @@ class MetalSearch:
         gain = partial(
             light_gain, gaussians, state.light, determined, rasterize, context.shading, limits, context.memory
         )
-        cubemap = context.shading.radiance_cubemap
+        cubemap = radiance_cubemap(context.shading)
         if cubemap is not None:
             become_metal(gaussians, state.light[cubemap.name], cubemap.radiance, metal, reflectance, gain)
         del measured

@@ -1,0 +1,91 @@
+"""``benchmarks/public/published.py`` compares measured scores of published datasets with published scores."""
+
+import sys
+from pathlib import Path
+
+import pytest
+from comparison_records import results, run
+from dataset_files import WRITERS
+from faults import Fault
+
+sys.path.append(str(Path(__file__).resolve().parents[2] / "benchmarks" / "public"))
+
+import published
+
+CAPTURES = {"pandora": "gnome", "pisr": "gundam", "nersp": "dog", "neisf": "pot"}
+
+
+@pytest.mark.parametrize("name", published.PUBLISHED_DATASETS)
+def test_a_capture_and_a_folder_of_captures_are_found(name: str, tmp_path: Path) -> None:
+    if name == "neisf":
+        pytest.importorskip("OpenEXR")
+    captures = [WRITERS[name](tmp_path / "all" / capture) for capture in ("a", "b")]
+    (tmp_path / "all" / "notes").mkdir()
+    assert published.find_captures(tmp_path / "all", name) == captures
+    assert published.find_captures(captures[0], name) == captures[:1]
+
+
+def test_other_datasets_and_missing_folders_are_refused(tmp_path: Path) -> None:
+    WRITERS["pandora"](tmp_path / "gnome")
+    Fault("gnome", "PISR", "pandora", "Unpack the dataset").raised_by(
+        published.find_captures, tmp_path / "gnome", "pisr"
+    )
+    Fault("nothing", "NeRSP", "no folder", "Unpack the dataset").raised_by(
+        published.find_captures, tmp_path / "nothing", "nersp"
+    )
+
+
+@pytest.mark.parametrize("name", published.PUBLISHED_DATASETS)
+def test_measured_scores_are_next_to_published_ones(name: str) -> None:
+    scored = [run(CAPTURES[name], recipe, 0, psnr=20.125, ssim=0.8) for recipe in ("3dgs", "3dgs-dr")]
+    sections = {section.key: section for section in published.published_sections(results(scored), name)}
+    measured = sections["publication-1"]
+    assert measured.title.startswith("Measured on ")
+    assert [cell[0] for cell in measured.blocks[0][1][0][1]] == ["20.12", "20.12"]
+    values = {
+        title: [cell[0] for cell in rows[0][1]]
+        for title, rows in (sections["publication-1-published"].blocks if len(sections) == 3 else ())
+    }
+    assert values == {
+        "pandora": {"Gnome (indoor)": ["17.65", "19.37", "21.13", "21.65", "22.54"]},
+        "pisr": {"Gundam (indoor)": ["15.42", "22.78", "22.93", "22.85", "23.32"]},
+    }.get(name, {})
+    notes = " ".join(sections["conditions"].notes)
+    assert ("has no scores of" in notes) == (name in ("nersp", "neisf"))
+    assert ("Chamfer distance of 0.5 mm" in notes) == (name == "pisr")
+
+
+def test_captures_without_published_scores_are_named() -> None:
+    scored = [
+        run(scene, recipe, 0, psnr=20.0) for scene in ("gnome", "owl") for recipe in ("3dgs", "3dgs-dr")
+    ]
+    *_, last = published.published_sections(results(scored), "pandora")
+    assert "PolarGuide-GSDR has no scores of owl." in last.notes
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["pandora", "pisr"])
+def test_the_command_prepares_trains_compares_and_resumes(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    WRITERS[name](tmp_path / "all" / CAPTURES[name])
+    command = [
+        "published.py",
+        name,
+        str(tmp_path / "all"),
+        "--out",
+        str(tmp_path / "out"),
+        "--downscale",
+        "1",
+    ]
+    command += ["--steps", "2", "--recipes", "3dgs", "3dgs-dr", "--device", "cpu"]
+    monkeypatch.setattr(sys, "argv", command)
+    published.main()
+    text = (tmp_path / "out" / "published.md").read_text()
+    assert "| PSNR ↑ |" in text
+    assert f"{CAPTURES[name]}: 1 of 4; names in results.json" in text
+    scores = sorted((tmp_path / "out" / name / "runs").rglob("metrics.json"))
+    assert len(scores) == 2
+    capsys.readouterr()
+    published.main()
+    assert "of them finished before: 2" in "".join(capsys.readouterr())
