@@ -282,6 +282,17 @@ def test_hot_pixels_are_found_and_noise_is_not():
     assert not found[~hot].any()
 
 
+@pytest.mark.filterwarnings("error")
+def test_hot_pixels_are_found_on_black():
+    rng = np.random.default_rng(3)
+    hot = rng.random((96, 128)) < 0.003
+    black = [64.0 + rng.integers(0, 3, hot.shape) for _ in range(3)]
+    assert defects(black, 2).sum() == 0
+    found = defects([view + 800 * hot for view in black], 2)
+    assert found[hot].mean() > 0.8
+    assert not found[~hot].any()
+
+
 def test_a_turned_camera_is_turned_back():
     """By 0.4 degrees about the middle, from shot to shot."""
     texture = cv2.GaussianBlur(np.random.default_rng(3).random((160, 200)), (0, 0), 1.5) * 2

@@ -298,9 +298,10 @@ def _noise(rise: NDArray[np.float32], middle: NDArray[np.float32]) -> NDArray[np
     number = np.clip(np.searchsorted(edges, level, side="right") - 1, 0, max(0, len(edges) - 2))
     bins = max(1, len(edges) - 1)
     sorted_deviation = deviation[np.argsort(number.astype(np.uint8), kind="stable")]  # by bin
-    ends = np.cumsum(np.bincount(number, minlength=bins))
-    medians = [float(np.median(each)) for each in np.split(sorted_deviation, ends[:-1])]
-    place = np.clip(np.searchsorted(edges, middle, side="right") - 1, 0, len(medians) - 1)
+    counts = np.bincount(number, minlength=bins)
+    filled = counts > 0  # without the others, samples between two bins get the noise of the lower one
+    medians = [float(np.median(each)) for each in np.split(sorted_deviation, np.cumsum(counts[filled])[:-1])]
+    place = np.clip(np.searchsorted(edges[:bins][filled], middle, side="right") - 1, 0, None)
     # Rounding to whole numbers causes noise of a third of a step.
     return np.maximum(1.4826 * np.asarray(medians, np.float32), 1 / 3)[place]
 
