@@ -145,11 +145,12 @@ def align_shots(
         shifts: shift of each shot.
 
     Returns:
-        The aligned intensities; for each of ``masks`` a mask [H, W] of the pixels that depend on a marked pixel of some
-        shot; and a mask [H, W] of the pixels that depend on a place outside a shot.
+        The aligned intensities, ``linear`` itself if no shot moved; for each of ``masks`` a mask [H, W] of the pixels
+        that depend on a marked pixel of some shot; and a mask [H, W] of the pixels that depend on a place outside a
+        shot.
     """
     height, width = linear.shape[1:3]
-    moved = linear.copy()
+    moved = linear.copy() if any(shift.corrected for shift in shifts) else linear
     each = [np.broadcast_to(mask, linear.shape[:3]).copy() for mask in masks]
     outside = np.zeros((height, width), bool)
     for index, shift in enumerate(shifts):
