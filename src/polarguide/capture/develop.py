@@ -145,9 +145,9 @@ def align_shots(
         shifts: shift of each shot.
 
     Returns:
-        The aligned intensities, ``linear`` itself if no shot moved; for each of ``masks`` a mask [H, W] of the pixels
-        that depend on a marked pixel of some shot; and a mask [H, W] of the pixels that depend on a place outside a
-        shot.
+        The aligned intensities; for each of ``masks`` a mask [H, W] of the pixels that depend on a marked pixel of some
+        shot; and a mask [H, W] of the pixels that depend on a place outside a shot. If no shot moved, the intensities
+        are ``linear`` itself.
     """
     height, width = linear.shape[1:3]
     moved = linear.copy() if any(shift.corrected for shift in shifts) else linear
