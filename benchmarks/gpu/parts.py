@@ -97,7 +97,7 @@ def train_on(job: Job, name: str, steps: int, folder: Path) -> dict[str, Any]:
 @torch.no_grad()
 def mean_psnr(scene: Scene, state: TrainingState, backend: Backend) -> float:
     """Return the mean over the test views, in decibels."""
-    shading, values = RECIPE.shading.bind(1.5), []
+    shading, values = RECIPE.shading, []
     for view in scene.test_views:
         picture = render(
             state.gaussians, view.camera, backend.rasterize, shading=shading, light=state.light

@@ -97,7 +97,10 @@ class AdditiveShading(ShadingModel):
     def light_parameters(self) -> Mapping[str, Parameter]:
         """Raw ``texels`` [6, R, R, 3] of the environment."""
         side = self.environment_resolution
-        return {"texels": Parameter((6, side, side, 3), self.environment_rate)}
+        radiance = RadianceCubemap(
+            "texels", torch.sigmoid, lambda light: torch.logit(light.clamp(_DARKEST, 1 - _DARKEST))
+        )
+        return {"texels": Parameter((6, side, side, 3), self.environment_rate, radiance=radiance)}
 
     def initialize(
         self, colors: Tensor, far: Tensor, generator: torch.Generator
@@ -123,7 +126,7 @@ class AdditiveShading(ShadingModel):
         rest = (1 - share)[..., None] * gaussians["sh_rest"]
         color = evaluate_sh(gaussians["means"], center, gaussians["sh_dc"], rest, degree) + 0.5
         if self.first_strength is not None:
-            share = share * self.strength(gaussians)[:, None]
+            share = share * torch.sigmoid(gaussians["strength_logits"])[:, None]
         return Channels(color.clamp(min=0), further={"share": share})
 
     def shade(self, splatted: GBuffer, light: Light, camera: Camera) -> dict[str, Any]:
@@ -151,15 +154,6 @@ class AdditiveShading(ShadingModel):
         constant = {name: result.layers[name].detach() for name in ("specular", "diffuse")}
         return super().predicted_stokes(result.with_layers(**constant), camera)
 
-    @property
-    def radiance_cubemap(self) -> RadianceCubemap:
-        """Radiance of the texels, in (0, 1)."""
-        return RadianceCubemap(
-            "texels",
-            torch.sigmoid,
-            lambda radiance: torch.logit(radiance.clamp(_DARKEST, 1 - _DARKEST)),
-        )
-
 
 @dataclass(frozen=True)
 class SurfelWeights(Weights):
@@ -183,7 +177,7 @@ class SurfelWeights(Weights):
 def polarization_term(step: Step, weights: SurfelWeights) -> Tensor | None:
     """Return the weighted sum of the L1 distances of S1/2 and S2/2, over reliable pixels."""
     priors = step.targets.priors
-    if priors is None or not weights.polarization or not step.shading.reflects:
+    if priors is None or not weights.polarization or not step.result.is_polarized:
         return None
     predicted = step.shading.predicted_stokes(step.result, priors.camera)
     distance = (predicted[1:] - priors.stokes[1:]).abs().mean(dim=(0, -1))

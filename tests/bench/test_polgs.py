@@ -26,7 +26,7 @@ from polarguide.runs.folder import load_checkpoint, save_checkpoint
 from polarguide.runs.model import write_run_ply
 from polarguide.shading.cubemap import texel_directions
 from polarguide.shading.gbuffer import RenderRequest, render
-from polarguide.shading.model import GBuffer
+from polarguide.shading.model import GBuffer, radiance_cubemap
 from polarguide.shading.result import RenderResult, channel_slices
 from polarguide.training.targets import Step, StepTargets, ViewPriors
 from polarguide_bench.polgs import (
@@ -39,7 +39,7 @@ from polarguide_bench.polgs import (
 from polarguide_bench.recipes import ablations_of
 
 INDEX = 1.4
-SHADING = AdditiveShading(environment_resolution=64).bind(INDEX)
+SHADING = AdditiveShading(environment_resolution=64, refractive_index=INDEX)
 CAMERA = Camera(
     48, 36, 60.0, 60.0, 24.0, 18.0, torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
 )
@@ -250,7 +250,7 @@ def test_it_resumes_to_the_same_bits_and_is_scored_and_exported(
     cameras = {each.name: each.camera for each in tiny_scene.views}
     page = share_page(gaussians, light, shading, cameras, first=view.name, title="PolGS")
     assert BAKED in page
-    cubemap = shading.radiance_cubemap
+    cubemap = radiance_cubemap(shading)
     assert cubemap is not None
     raw = torch.linspace(-5, 5, 11)
     torch.testing.assert_close(cubemap.raw(cubemap.radiance(raw)), raw)

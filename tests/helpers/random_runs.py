@@ -33,7 +33,7 @@ def random_state(name: str, count: int = 300, *, metal: bool = False) -> tuple[T
         "sh_rest": 0.1 * normal(count, 15, 3),
     }
     light: dict[str, Tensor] = {}
-    if recipe.shading.reflects:
+    if "specular" in recipe.shading.layers:
         model = replace(recipe.shading, environment_resolution=8, environment_spread=1.5)  # type: ignore[call-arg]
         near = torch.zeros(count, dtype=torch.bool)
         first, light = model.initialize(0.5 + 0.28 * gaussians["sh_dc"], near, generator)
@@ -54,7 +54,7 @@ def random_state(name: str, count: int = 300, *, metal: bool = False) -> tuple[T
     trained = Gaussians(gaussians, recipe.learning_rates)
     state = TrainingState(0, trained, environment)
     state.extra = {name: torch.zeros(count) for name in ("statistics.gradient", "statistics.seen")}
-    return state, recipe.shading.bind(1.5)
+    return state, recipe.shading
 
 
 def ring(count: int = 6, distance: float = 4.0, width: int = 64, height: int = 48) -> dict[str, Camera]:

@@ -21,12 +21,13 @@ from polarguide.training.losses import (
     normal_terms_reference,
     pixel_terms,
 )
-from polarguide.training.targets import Step, StepTargets, ViewPriors, stokes_weight, surface_weight
+from polarguide.training.priors import stokes_weight, surface_weight
+from polarguide.training.targets import Step, StepTargets, ViewPriors
 
 HEIGHT, WIDTH = 37, 70  # more than one block of pixels in a row, and more than one part
 SIZE = (HEIGHT, WIDTH)
 INPUTS = ("normal", "specular", "diffuse", "depth")
-SHADING = DeferredShading("fresnel").bind(1.4)
+SHADING = DeferredShading("fresnel", refractive_index=1.4)
 ALL = Weights(stokes=0.9, azimuth=0.15, chromatic=0.05, normal=0.2, consistency=0.1)
 
 
@@ -215,9 +216,7 @@ class Mirror(DeferredShading):
 
 
 def test_a_model_with_a_prediction_of_its_own_takes_the_reference_for_it() -> None:
-    mirror = Mirror("fresnel").bind(1.4)
-    assert SHADING.smooth_dielectric
-    assert not mirror.smooth_dielectric
+    mirror = Mirror("fresnel", refractive_index=1.4)
     found = with_gradients(native(ALL, mirror), torch.float32)
     assert_same(found, with_gradients(reference(ALL, mirror), torch.float64))
 

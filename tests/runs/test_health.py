@@ -109,7 +109,7 @@ def test_a_training_that_has_burned_is_named() -> None:
         name: values.float() if values.is_floating_point() else values for name, values in stored.items()
     }
     state = TrainingState.from_tensors(tensors, STOKES)
-    model = GaussianModel(state, STOKES.shading.bind(1.5), choose_backend("cpu"))
+    model = GaussianModel(state, STOKES.shading, choose_backend("cpu"))
     found = examined(model, scene)
     burned = {name for name, view in found.views.items() if view.burned > Limits().burned}
     assert {"v030", "v006", "v012"} <= burned < set(found.views)

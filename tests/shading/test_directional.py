@@ -14,7 +14,7 @@ from polarguide.geometry.camera import Camera
 from polarguide.raster.cpu import rasterize_cpu
 from polarguide.results.export.adapters import ply_fields
 from polarguide.shading.cubemap import box_mips, cubemap_lookup_reference, mip_lookup, mip_lookup_reference
-from polarguide.shading.directional import CHANNELS, FEATURES, DirectionalShading, albedo_of
+from polarguide.shading.directional import CHANNELS, FEATURES, DirectionalShading
 from polarguide.shading.gbuffer import RenderRequest, render, single_colors
 from polarguide.shading.model import MAXIMUM_LOG_LIGHT, PLAIN, GBuffer, base_colors, mirrored
 from polarguide.shading.result import channel_slices
@@ -129,7 +129,7 @@ def test_without_harmonics_the_view_changes_only_the_specular_layer(gaussians: d
     one["means"], one["log_scales"] = torch.zeros(1, 3), torch.full((1, 3), 3.0)
     result = render(one, camera(), rasterize_cpu, shading=SHADING, light=light())
     color = result.diffuse[10, 12] / result.alpha[10, 12]  # type: ignore[index]
-    assert_close(color, albedo_of(one)[0], rtol=1e-4, atol=1e-5)
+    assert_close(color, SHADING.surface[0].values(one)[0], rtol=1e-4, atol=1e-5)
 
 
 def test_first_values_are_those_asked_for() -> None:
@@ -139,7 +139,7 @@ def test_first_values_are_those_asked_for() -> None:
     colors = torch.tensor([[0.5, 0.2, 0.1], [0.0, 1.0, 0.3]])
     near = torch.zeros(2, dtype=torch.bool)
     gaussians, values = shading.initialize(colors, near, torch.Generator().manual_seed(0))
-    assert_close(albedo_of(gaussians), (0.4 * colors).clamp(min=1e-3))
+    assert_close(shading.surface[0].values(gaussians), (0.4 * colors).clamp(min=1e-3))
     assert_close(torch.sigmoid(gaussians["roughness_logits"]), torch.full((2,), 0.3))
     assert values["texels"].shape == (6, 4, 4, CHANNELS)
     assert_close(values["mlp_bias_2"].exp(), torch.full((3,), 0.1))

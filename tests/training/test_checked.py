@@ -32,8 +32,8 @@ def stepped(scene: Scene, recipe: Recipe) -> TrainingState:
     state = first_state(context_of(scene, recipe, TrainSettings(10, 0)))
     for trained in (state.gaussians, state.environment):
         if trained is not None:
-            for values in trained.trained():
-                values.grad = torch.ones_like(values)
+            for name in trained._adam.rates:
+                trained._tensors[name].grad = torch.ones_like(trained._tensors[name])
             trained.step()
     state.extra = {f"frozen.{name}": values for name, values in state.gaussians.snapshot().items()}
     state.extra |= {

@@ -39,6 +39,15 @@ def same(a: Entry, b: Entry) -> bool:
     )
 
 
+def fetched(store: ViewStore, view: str, make: Callable[[], Entry], *, disposable: bool = False) -> Entry:
+    """The stored entry of a view, made and stored if it is missing."""
+    entry = store.get("kind", view)
+    if entry is None:
+        entry = make()
+        store.keep("kind", view, entry, disposable=disposable)
+    return entry
+
+
 def test_what_a_training_keeps_where_does_not_change_its_bits(
     tiny_scene: Scene, busy_recipe: Recipe, tmp_path: Path
 ) -> None:
@@ -76,25 +85,25 @@ def test_entries_come_back_from_memory_and_file(tmp_path: Path) -> None:
     store = ViewStore(4000, tmp_path)
     for _ in range(3):
         for seed in range(4):
-            assert same(store.get("kind", f"v{seed}", maker(seed)), entry_of(seed))
+            assert same(fetched(store, f"v{seed}", maker(seed)), entry_of(seed))
     assert made == [0, 1, 2, 3]
     assert 0 < store.in_memory <= 4000
     length = store.in_file
     store.drop("kind")
     assert store.in_memory == 0
     for seed in range(4):
-        store.get("kind", f"v{seed}", maker(seed + 10))
+        fetched(store, f"v{seed}", maker(seed + 10))
     assert made[4:] == [10, 11, 12, 13]
     assert store.in_file == length, "places are used again"
-    assert same(store.get("kind", "v3", maker(0)), entry_of(13))
+    assert same(fetched(store, "v3", maker(0)), entry_of(13))
     store.drop("kind", "v3")
-    assert same(store.get("kind", "v3", maker(20)), entry_of(20))
+    assert same(fetched(store, "v3", maker(20)), entry_of(20))
 
 
 def test_what_can_be_had_cheaply_is_not_put_into_the_file(tmp_path: Path) -> None:
     store, made = ViewStore(0, tmp_path), []
     for _ in range(2):
-        store.get("kind", "v", lambda: made.append(0) or entry_of(0), disposable=True)  # type: ignore[func-returns-value]
+        fetched(store, "v", lambda: made.append(0) or entry_of(0), disposable=True)  # type: ignore[func-returns-value]
     assert len(made) == 2
     assert store.in_file == 0
 
@@ -109,7 +118,7 @@ def test_a_disk_without_room_is_said_once_and_costs_only_time(
     said: list[str] = []
     store = ViewStore(0, tmp_path, said.append)
     for seed in (0, 1, 0):
-        assert same(store.get("kind", f"v{seed}", lambda seed=seed: entry_of(seed)), entry_of(seed))
+        assert same(fetched(store, f"v{seed}", lambda seed=seed: entry_of(seed)), entry_of(seed))
     (warning,) = said
     assert "No space left on device" in warning
 
@@ -117,9 +126,9 @@ def test_a_disk_without_room_is_said_once_and_costs_only_time(
 def test_a_file_that_was_cut_is_made_again(tmp_path: Path) -> None:
     store = ViewStore(0, tmp_path)
     for seed in range(2):
-        store.get("kind", f"v{seed}", lambda seed=seed: entry_of(seed))
+        fetched(store, f"v{seed}", lambda seed=seed: entry_of(seed))
     store._file.truncate(100)
-    assert same(store.get("kind", "v1", lambda: entry_of(1)), entry_of(1))
+    assert same(fetched(store, "v1", lambda: entry_of(1)), entry_of(1))
 
 
 @pytest.mark.parametrize("scale", [1.0, 0.3, 40.0])

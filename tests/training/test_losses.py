@@ -28,10 +28,11 @@ from polarguide.training.losses import (
     term,
 )
 from polarguide.training.photometric import photometric_loss
-from polarguide.training.targets import Step, StepTargets, ViewPriors, stokes_weight, surface_weight
+from polarguide.training.priors import stokes_weight, surface_weight
+from polarguide.training.targets import Step, StepTargets, ViewPriors
 
 SIZE = (12, 14)
-GLASS = DeferredShading("fresnel").bind(1.5)
+GLASS = DeferredShading("fresnel")
 SCALES = torch.tensor([[-3.0, -2.0, -1.0], [-1.0, -4.0, -2.0], [0.0, 0.0, -5.0]])
 
 
@@ -169,7 +170,7 @@ def test_chromatic_loss_has_a_weight_of_its_own(priors: ViewPriors) -> None:
 def test_stokes_loss_is_zero_for_the_layers_and_normals_that_were_measured(priors: ViewPriors) -> None:
     rendered = result(specular=LAYERS[0], diffuse=LAYERS[1], normal=0.7 * FACING)
     assert float(stokes_loss(rendered, priors, GLASS)) == pytest.approx(0.0, abs=1e-6)
-    assert float(stokes_loss(rendered, priors, GLASS.bind(1.4))) > 1e-3
+    assert float(stokes_loss(rendered, priors, replace(GLASS, refractive_index=1.4))) > 1e-3
     swapped = result(specular=LAYERS[1], diffuse=LAYERS[0], normal=FACING)
     assert float(stokes_loss(swapped, priors, GLASS)) > 1e-2
     nothing = replace(priors, stokes_weight=torch.zeros(SIZE))

@@ -24,7 +24,7 @@ from polarguide.training.photometric import partial_terms, photometric_loss
 from polarguide.training.targets import PartialView, Step, StepTargets
 
 SIZE = (12, 14)
-GLASS = DeferredShading("fresnel").bind(1.5)
+GLASS = DeferredShading("fresnel")
 CPU = torch.device("cpu")
 CAMERA = Camera(
     SIZE[1],

@@ -162,8 +162,8 @@ def test_every_recipe_is_named_described_and_trains_what_it_renders(recipe: Reci
         "metalness",
         "index_offset",
     }
-    assert recipe.shading.reflects == any(stage.reflection for stage in recipe.stages)
-    assert recipe.shading.reflects == bool(recipe.light_rates)
+    assert ("specular" in recipe.shading.layers) == any(stage.reflection for stage in recipe.stages)
+    assert ("specular" in recipe.shading.layers) == bool(recipe.light_rates)
     assert list(recipe.sh_fractions) == sorted(recipe.sh_fractions)
 
 

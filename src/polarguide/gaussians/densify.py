@@ -14,7 +14,7 @@ from torch import Tensor
 
 from polarguide.gaussians.gaussians import Gaussians
 from polarguide.gaussians.geometry import quaternions_to_rotations
-from polarguide.geometry.camera import Camera
+from polarguide.geometry.camera import Camera, seen_at
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,11 +49,8 @@ def free_space(points: Tensor, cameras: Sequence[Camera], share: float, quantile
     """
     radii = []
     for camera in cameras:
-        x, y, z = camera.to_camera(points.double() - camera.center).unbind(-1)
-        column = camera.fx * x / z + camera.cx
-        row = camera.fy * y / z + camera.cy
-        inside = (z > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
-        depths = z[inside]
+        _, depth, inside = seen_at(points.double() - camera.center, camera)
+        depths = depth[inside]
         radii.append(share * float(torch.quantile(depths, quantile)) if len(depths) else 0.0)
     centers = torch.stack([camera.center for camera in cameras]).float()
     return FreeSpace(centers, torch.tensor(radii))
@@ -126,14 +123,6 @@ class DensityStatistics:
     def __init__(self, count: int, device: torch.device | None = None) -> None:
         self._device = device
         self.clear(count)
-
-    @classmethod
-    def of(cls, gradient: Tensor, counts: Tensor) -> DensityStatistics:
-        """Create statistics from existing sums."""
-        statistics = cls(0, gradient.device)
-        statistics.gradient = gradient
-        statistics.seen = counts
-        return statistics
 
     def add(self, screen_gradient: Tensor, radii: Tensor, width: int, height: int) -> None:
         """Add one picture.

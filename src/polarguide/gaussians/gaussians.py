@@ -123,15 +123,6 @@ class Trained:
         own = {name: rate for name, rate in rates.items() if name in self._tensors}
         self._adam = Adam(own, epsilon=1e-15)
 
-    def trained(self) -> list[Tensor]:
-        """Return the trained tensors, in the order of their rates."""
-        return [self._tensors[name] for name in self._adam.rates]
-
-    @property
-    def rates(self) -> dict[str, float]:
-        """Learning rates of the trained tensors by name."""
-        return dict(self._adam.rates)
-
     def set_rate(self, name: str, rate: float) -> None:
         """Set the learning rate of one tensor, if it is trained."""
         if name in self._adam.rates:

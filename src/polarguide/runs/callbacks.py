@@ -169,7 +169,7 @@ class Progress(Callback[Loop]):
 
 @dataclass(eq=False)
 class Checkpoints(Callback[Loop]):
-    """Callback that saves checkpoints at regular intervals; rank 0 writes them.
+    """Callback that saves checkpoints at regular intervals.
 
     Args:
         out: the run folder.

@@ -569,7 +569,7 @@ def held_out_score(loop: TrainingLoop) -> HeldOutScore:
 
     @torch.no_grad()
     def score() -> float | None:
-        model = GaussianModel.of(loop.state, context.recipe, context.settings, context.backend)
+        model = GaussianModel(loop.state, context.shading, context.backend)
         scores = []
         for view in context.memory.between(views):
             local = view.to(model.device)
@@ -605,7 +605,7 @@ class HealthCheck(Callback[TrainingLoop]):
         support = PolarizationSupport.of(views, polarizers.judgments(), measured=priors, fitted=filters)
         held_out = {view.name: view.camera for view in context.scene.test_views}
         evidence = TrainingEvidence(views, support, filters=filters, held_out=held_out)
-        model = GaussianModel.of(loop.state, recipe, context.settings, context.backend)
+        model = GaussianModel(loop.state, context.shading, context.backend)
         health = examine(model, evidence, context.scene.points, context.settings.steps, context.reporter)
         for warning in health.warnings:
             context.reporter.warn(warning)
@@ -791,7 +791,7 @@ class MetalReport(Callback[TrainingLoop]):
 
     def at_end(self, loop: TrainingLoop) -> None:
         context = loop.context
-        model = GaussianModel.of(loop.state, context.recipe, context.settings, context.backend)
+        model = GaussianModel(loop.state, context.shading, context.backend)
         undecided = MetalSearch(loop.current).undecided(loop.state)
         report_metals(self.out, context.scene, undecided, model, self.reporter)
 

@@ -116,7 +116,12 @@ def share_memory(
     if limit is not None:
         allowed = int(limit * GIBIBYTE)
         if allowed < least:
-            raise too_little(least, allowed, what, less)
+            raise PolarguideError(
+                "memory",
+                expected=f"at least {in_gigabytes(least)} for pictures of this size{what}",
+                found=in_gigabytes(allowed, up=False),
+                remedy=f"Use --memory {in_gigabytes(least).replace(' ', '')}, {less}--downscale 2.",
+            )
     else:
         allowed = resident + int(SHARE * free_memory())
     if total_need <= allowed:
@@ -137,16 +142,6 @@ def pixels_of(folder: Path, downscale: int) -> list[int]:
     """
     layout = find_layout(folder)
     return [count // downscale**2 for count in stated_pixels(layout, select_views(layout, None))]
-
-
-def too_little(least: int, allowed: int, what: str, less: str) -> PolarguideError:
-    """Return the error for a memory limit that is too small for pictures and ``what``; ``less`` extends the remedy."""
-    return PolarguideError(
-        "memory",
-        expected=f"at least {in_gigabytes(least)} for pictures of this size{what}",
-        found=in_gigabytes(allowed, up=False),
-        remedy=f"Use --memory {in_gigabytes(least).replace(' ', '')}, {less}--downscale 2.",
-    )
 
 
 def in_gigabytes(count: int, *, up: bool = True) -> str:

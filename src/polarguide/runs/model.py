@@ -27,8 +27,6 @@ from polarguide.raster.surface import alpha_in_front
 from polarguide.shading.gbuffer import RenderRequest, render, single_colors, splats
 from polarguide.shading.model import Light, Parameters, ShadingModel
 from polarguide.shading.result import LAYERS, POLARIZED, RenderResult
-from polarguide.training.recipe import Recipe
-from polarguide.training.settings import ResolvedSettings
 from polarguide.training.state import TrainingState
 
 Within = Callable[[Tensor], Tensor]
@@ -51,13 +49,6 @@ class GaussianModel:
     state: TrainingState
     shading: ShadingModel
     backend: Backend
-
-    @classmethod
-    def of(
-        cls, state: TrainingState, recipe: Recipe, settings: ResolvedSettings, backend: Backend
-    ) -> GaussianModel:
-        """Return the model of a training's state."""
-        return cls(state, recipe.shading.bind(settings.refractive_index), backend)
 
     @property
     def device(self) -> torch.device:
@@ -160,7 +151,16 @@ def gaussian_colors(gaussians: Parameters, light: Light, shading: ShadingModel, 
     Returns:
         Colors [N, K, 3]. Each Gaussian is shaded with its own normal, because a single splat has no blended normal.
     """
-    return torch.stack(_toward(gaussians, light, shading, directions), dim=1)
+    means = gaussians["means"]
+    center = means.new_zeros(3)
+    normals = shortest_axis_normals(means, gaussians["quaternions"], gaussians["log_scales"], center)
+    colors = []
+    for direction in directions.to(means.device):
+        # A camera far behind each Gaussian sees it along one direction.
+        facing = torch.where((normals @ direction)[:, None] > 0, -normals, normals)
+        rays = direction.expand(len(means), 3)
+        colors.append(single_colors(gaussians, light, shading, rays, facing))
+    return torch.stack(colors, dim=1)
 
 
 @torch.no_grad()
@@ -194,20 +194,6 @@ def baked_harmonics(
         return present(gaussian_colors(batch, light, shading, directions))
 
     return refit_sh(colors, normals, srgb_slope if linear else None)
-
-
-def _toward(gaussians: Parameters, light: Light, shading: ShadingModel, directions: Tensor) -> list[Tensor]:
-    """Compute ``gaussian_colors`` for one direction at a time, as a list of K tensors [N, 3]."""
-    means = gaussians["means"]
-    center = means.new_zeros(3)
-    normals = shortest_axis_normals(means, gaussians["quaternions"], gaussians["log_scales"], center)
-    colors = []
-    for direction in directions.to(means.device):
-        # A camera far behind each Gaussian sees it along one direction.
-        facing = torch.where((normals @ direction)[:, None] > 0, -normals, normals)
-        rays = direction.expand(len(means), 3)
-        colors.append(single_colors(gaussians, light, shading, rays, facing))
-    return colors
 
 
 @torch.no_grad()

@@ -108,12 +108,13 @@ class OpenedRun:
             raise PolarguideError("recipe", expected=expected, found=method.name, remedy=remedy)
         backend = choose_backend(device, say=reporter.say)
         state = load_checkpoint(folder, method, backend.device)
-        if values_differ(method.shading.data(), configuration.recipe_data.get("shading", {})):
+        if values_differ(method.data()["shading"], configuration.recipe_data.get("shading", {})):
             _warn(
                 f"{folder} was trained with other shading values of the recipe {method.name} than those of this "
                 "version, which shades its pictures."
             )
-        model = GaussianModel.of(state, method, configuration.settings, backend)
+        shading = replace(method.shading, refractive_index=configuration.settings.refractive_index)
+        model = GaussianModel(state, shading, backend)
         return cls(folder, configuration, method, model, scene=scene, reporter=reporter)
 
     @classmethod

@@ -129,7 +129,7 @@ def train_gaussians(
                 HealthCheck(out, fits, recorded),
             ]
             run_to_the_end(loop, out, session, reporter, should_stop, look, plan.peak, held_out_score(loop))
-        model = GaussianModel.of(loop.state, method, resolved, backend)
+        model = GaussianModel(loop.state, context.shading, backend)
     return OpenedRun(out, configuration, method, model, scene=original, reporter=reporter)
 
 

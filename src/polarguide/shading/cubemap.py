@@ -184,26 +184,6 @@ def cubemap_lookup_reference(texture: Tensor, directions: Tensor) -> Tensor:
     return ringed_lookup(ringed_texels(texture), face_coordinates(directions), texture.shape[1])
 
 
-class _Lookup(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, texture: Tensor, directions: Tensor) -> Tensor:
-        texture = texture.detach().contiguous()
-        directions = directions.detach().contiguous()
-        out = texture.new_empty(directions.shape[0], texture.shape[-1])
-        _native.cubemap_forward(texture, directions, out)
-        ctx.save_for_backward(texture, directions)
-        return out
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, Tensor | None]:
-        texture, directions = ctx.saved_tensors
-        to_texture = torch.empty_like(texture) if ctx.needs_input_grad[0] else None
-        to_directions = torch.empty_like(directions) if ctx.needs_input_grad[1] else None
-        _native.cubemap_backward(texture, directions, grad.contiguous(), to_texture, to_directions)
-        return to_texture, to_directions
-
-
 def cubemap_lookup(texture: Tensor, directions: Tensor) -> Tensor:
     """Look up a cubemap by bilinear interpolation without seams: ``sum_k w_k(direction) texel_k`` over four texels.
 
@@ -231,7 +211,7 @@ def cubemap_lookup(texture: Tensor, directions: Tensor) -> Tensor:
     if directions.ndim != 2 or directions.shape[1] != 3:
         raise ValueError(f"directions: expected shape [P, 3], found {list(directions.shape)}")
     if fits(texture, directions):
-        result: Tensor = _Lookup.apply(texture, directions)
+        result: Tensor = _Lookup.apply(directions, directions.new_zeros(len(directions)), texture)
         return result
     return cubemap_lookup_reference(texture, directions)
 
@@ -272,14 +252,17 @@ def box_mips(texture: Tensor) -> list[Tensor]:
     return levels
 
 
-class _Between(torch.autograd.Function):
+class _Lookup(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, directions: Tensor, level: Tensor, *levels: Tensor) -> Tensor:
         directions = directions.detach().contiguous()
         level = level.detach().contiguous()
         contiguous = [t.detach().contiguous() for t in levels]
         out = directions.new_empty(len(directions), contiguous[0].shape[-1])
-        _native.mips_forward(contiguous, directions, level, out)
+        if len(contiguous) == 1:
+            _native.cubemap_forward(contiguous[0], directions, out)
+        else:
+            _native.mips_forward(contiguous, directions, level, out)
         ctx.save_for_backward(directions, level, *contiguous)
         return out
 
@@ -344,7 +327,7 @@ def mip_lookup(levels: Sequence[Tensor], directions: Tensor, level: Tensor) -> T
     """
     native = len(levels) <= MOST_LEVELS and 1 <= levels[0].shape[-1] <= MOST_CHANNELS
     if native and fits(directions, level, *levels):
-        looked_up: Tensor = _Between.apply(directions, level, *levels)
+        looked_up: Tensor = _Lookup.apply(directions, level, *levels)
         return looked_up
     return mip_lookup_reference(levels, directions, level)
 

@@ -162,7 +162,9 @@ class DeferredShading(ShadingModel):
     def light_parameters(self) -> Mapping[str, Parameter]:
         """Raw ``texels`` [6, R, R, 3] of the environment."""
         side = self.environment_resolution
-        return {"texels": Parameter((6, side, side, 3), self.environment_rate)}
+        note = LOCAL_NOTE if self.local else ""
+        radiance = RadianceCubemap("texels", self.radiance, self.raw_texels, note)
+        return {"texels": Parameter((6, side, side, 3), self.environment_rate, radiance=radiance)}
 
     def initialize(
         self, colors: Tensor, far: Tensor, generator: torch.Generator
@@ -189,11 +191,6 @@ class DeferredShading(ShadingModel):
         if self.blend == "lerp":
             return torch.logit(radiance.clamp(_NO_LIGHT, 1 - _NO_LIGHT))
         return torch.log(radiance.clamp(min=_NO_LIGHT)).clamp(max=MAXIMUM_LOG_LIGHT)
-
-    @property
-    def radiance_cubemap(self) -> RadianceCubemap | None:
-        """Radiance of the texels."""
-        return RadianceCubemap("texels", self.radiance, self.raw_texels, LOCAL_NOTE if self.local else "")
 
     def light_levels(self, texels: Tensor, *, rough: bool) -> list[Tensor]:
         """Return the levels of light that the look-up needs.

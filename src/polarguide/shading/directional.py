@@ -43,6 +43,7 @@ from polarguide.shading.model import (
     base_colors,
     mirrored,
 )
+from polarguide.shading.surface import SurfaceProperty
 
 CHANNELS = 16
 """Number of channels of the grid."""
@@ -58,9 +59,8 @@ _DARKEST = 1e-3
 """Least initial albedo, so that the logarithm of a black point is finite."""
 
 
-def albedo_of(gaussians: Parameters) -> Tensor:
-    """Return the albedo [N, 3], ``exp(min(x, 5)) / 5`` of the parameter ``log_albedo``."""
-    return ALBEDO_SCALE * gaussians["log_albedo"].clamp(max=MAXIMUM_LOG_LIGHT).exp()
+def _albedo(logarithms: Tensor) -> Tensor:
+    return ALBEDO_SCALE * logarithms.clamp(max=MAXIMUM_LOG_LIGHT).exp()
 
 
 @dataclass(frozen=True)
@@ -94,17 +94,15 @@ class DirectionalShading(ShadingModel):
     stream: ClassVar[int] = 5
 
     @property
-    def parameters(self) -> Mapping[str, Parameter]:
-        """Per-Gaussian tensors: ``log_albedo`` [N, 3], ``roughness_logits`` [N], ``features`` [N, 4], ``surface`` [N].
-
-        ``surface`` is 0 or 1, and it is not trained.
-        """
-        return {
-            "log_albedo": Parameter((3,), self.albedo_rate),
-            "roughness_logits": Parameter((), self.feature_rate),
-            "features": Parameter((FEATURES,), self.feature_rate),
-            "surface": Parameter((), 0.0),
-        }
+    def surface(self) -> tuple[SurfaceProperty, ...]:
+        """Albedo, roughness, feature vector, and ``surface``, which is 0 or 1 and not trained."""
+        rate = self.feature_rate
+        return (
+            SurfaceProperty("albedo", "log_albedo", channels=3, activation=_albedo, rate=self.albedo_rate),
+            SurfaceProperty("roughness", "roughness_logits", activation=torch.sigmoid, rate=rate),
+            SurfaceProperty("feature", "features", channels=FEATURES, activation=torch.tanh, rate=rate),
+            SurfaceProperty("surface", "surface"),
+        )
 
     @property
     def light_parameters(self) -> Mapping[str, Parameter]:
@@ -178,7 +176,9 @@ class DirectionalShading(ShadingModel):
         other channels are 0.
         """
         surface = gaussians["surface"].detach()[:, None]
-        colors = torch.where(surface > 0, albedo_of(gaussians), base_colors(gaussians, center, degree))
+        colors = torch.where(
+            surface > 0, _albedo(gaussians["log_albedo"]), base_colors(gaussians, center, degree)
+        )
         further = {
             "blur": surface * torch.sigmoid(gaussians["roughness_logits"])[:, None],
             "feature": surface * torch.tanh(gaussians["features"]),

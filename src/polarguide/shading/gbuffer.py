@@ -203,7 +203,7 @@ def render(
         footprints: [N] pixel sizes of the training, which keep magnified pictures smooth, see ``raster.magnification``.
             With None, Gaussians are drawn without additional blur, as in a training.
     """
-    normals = request.normals or shading.reflects
+    normals = request.normals or "specular" in shading.layers
     depth = request.depth
     gaussian_splats, layout = splatting(
         gaussians, camera, shading, sh_degree=request.sh_degree, normals=normals, depth=depth
@@ -256,10 +256,9 @@ def shaded(
     return layers | {name: again[name.removeprefix("detached_")] for name in DETACHED}
 
 
-Split = tuple[Tensor, Tensor | None, Tensor | None]
-
-
-def split(features: Tensor, alpha: Tensor, layout: ChannelSlices) -> Split:
+def split(
+    features: Tensor, alpha: Tensor, layout: ChannelSlices
+) -> tuple[Tensor, Tensor | None, Tensor | None]:
     """Extract the normal and the depth from a G-buffer.
 
     In float32 on the CPU this is a native pass, and otherwise ``split_reference``. If there is no gradient and no
@@ -272,7 +271,9 @@ def split(features: Tensor, alpha: Tensor, layout: ChannelSlices) -> Split:
     return split_reference(features, alpha, layout)
 
 
-def split_reference(features: Tensor, alpha: Tensor, layout: ChannelSlices) -> Split:
+def split_reference(
+    features: Tensor, alpha: Tensor, layout: ChannelSlices
+) -> tuple[Tensor, Tensor | None, Tensor | None]:
     """Extract the normal and the depth from a G-buffer, for any dtype and device.
 
     Args:
@@ -303,20 +304,6 @@ class _RayCamera(Camera):
         return rays.to(device, dtype)
 
 
-def _values_along(
-    gaussians: Parameters, shading: ShadingModel, rays: Tensor, normals: Tensor
-) -> dict[str, Tensor]:
-    """Return the channels of Gaussians by name, where each Gaussian is seen along its own ray.
-
-    For this, the camera is at the origin, and the ray is used as the position of the Gaussian.
-    """
-    names = (*CORE_SHAPES, *shading.parameters)
-    tensors = {name: values for name in names if (values := gaussians.get(name)) is not None}
-    tensors["means"] = rays
-    origin = rays.new_zeros(3)
-    return {**shading.channels(tensors, origin, 3).values(tensors, normals, origin, 3), "normal": normals}
-
-
 def single_colors(
     gaussians: Parameters, light: Light, shading: ShadingModel, rays: Tensor, normals: Tensor
 ) -> Tensor:
@@ -330,7 +317,12 @@ def single_colors(
     Returns:
         Linear colors [N, 3].
     """
-    values = _values_along(gaussians, shading, rays, normals)
+    names = (*CORE_SHAPES, *shading.parameters)
+    tensors = {name: own for name in names if (own := gaussians.get(name)) is not None}
+    # The camera is at the origin, and each Gaussian lies at the end of its own ray.
+    tensors["means"] = rays
+    origin = rays.new_zeros(3)
+    values = shading.channels(tensors, origin, 3).values(tensors, normals, origin, 3) | {"normal": normals}
     order = ("color", "normal", *(name for name in values if name not in ("color", "normal")))
     features = torch.cat([values[name] for name in order], dim=1)[:, None]
     layout = channel_slices({name: values[name].shape[1] for name in order})

@@ -7,15 +7,14 @@ Training, rendering, the viewer and the exports use these members. A new shading
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import Any, ClassVar, NamedTuple, TypeVar
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
 
-from polarguide.core.errors import PolarguideError
 from polarguide.gaussians.gaussians import Parameters as Parameters
 from polarguide.gaussians.geometry import mirrored_directions
 from polarguide.gaussians.harmonics import evaluate_sh
@@ -24,6 +23,7 @@ from polarguide.geometry.vectors import dot
 from polarguide.shading.metal import layer_stokes
 from polarguide.shading.result import ChannelSlices, MetalPixels, RenderResult
 from polarguide.shading.surface import Parameter as Parameter
+from polarguide.shading.surface import RadianceCubemap as RadianceCubemap
 from polarguide.shading.surface import SurfaceProperty, surface_channels
 
 MAXIMUM_LOG_LIGHT = 5.0
@@ -33,8 +33,6 @@ PLAIN_LAYERS = ("final", "normal", "depth", "alpha")
 
 Light = Mapping[str, Tensor]
 """The learned light of a shading model: parameters by name."""
-
-Model = TypeVar("Model", bound="ShadingModel")
 
 
 class Channels(NamedTuple):
@@ -123,33 +121,17 @@ class GBuffer:
         return mean[..., 0] if mean.shape[-1] == 1 else mean
 
 
-class RadianceCubemap(NamedTuple):
-    """Parameter of the light that represents radiance from distant surroundings.
-
-    Such light can be exported, rotated and replaced.
-
-    Attributes:
-        name: name of the parameter, raw texels [6, R, R, 3].
-        radiance: function from raw values to linear radiance, [..., 3].
-        raw: inverse of ``radiance``, limited to the range of raw values.
-        note: text about light that does not change when this light is rotated or replaced. Empty if all light changes.
-    """
-
-    name: str
-    radiance: Callable[[Tensor], Tensor]
-    raw: Callable[[Tensor], Tensor]
-    note: str = ""
-
-
 @dataclass(frozen=True)
 class ShadingModel(ABC):
     """Base class of shading models: learned parameters, splatted channels, and the computation of pictures.
 
-    Subclasses are frozen dataclasses. Their fields are part of the recipe and are recorded in the run folder. The
-    refractive index belongs to the run, see ``bind``.
+    Subclasses are frozen dataclasses. Their fields are part of the recipe and are recorded in the run folder.
 
     Attributes:
-        refractive_index: refractive index of all surfaces.
+        refractive_index: refractive index of all surfaces. It belongs to the run, not to the recipe.
+
+    Raises:
+        ValueError: the refractive index is 1 or less.
     """
 
     refractive_index: float = field(default=1.5, kw_only=True)
@@ -157,21 +139,9 @@ class ShadingModel(ABC):
     stream: ClassVar[int] = 6
     """Index of the random stream from which initial values are drawn."""
 
-    def bind(self: Model, refractive_index: float) -> Model:
-        """Return a copy of the model with the refractive index of a run.
-
-        Raises:
-            ValueError: the refractive index is 1 or less.
-        """
-        if not refractive_index > 1:
-            raise ValueError(f"refractive index: expected more than 1, found {refractive_index}")
-        return replace(self, refractive_index=refractive_index)
-
-    def data(self) -> dict[str, Any]:
-        """Return the name of the class and all fields of the recipe as JSON values, for a run's folder."""
-        values = asdict(self)
-        del values["refractive_index"]
-        return {"model": type(self).__name__, **values}
+    def __post_init__(self) -> None:
+        if not self.refractive_index > 1:
+            raise ValueError(f"refractive index: expected more than 1, found {self.refractive_index}")
 
     # Parameters
 
@@ -215,7 +185,7 @@ class ShadingModel(ABC):
     def layers(self) -> tuple[str, ...]:
         """Names of the layers in pictures, from ``shading.result.LAYERS``.
 
-        They contain "specular" if the model reflects.
+        They contain "specular" if the model reflects. In this case, normals are always splatted.
         """
         return ("final", "base", "specular", "diffuse", "normal", "depth", "alpha")
 
@@ -241,46 +211,13 @@ class ShadingModel(ABC):
     def predicted_stokes(self, result: RenderResult, camera: Camera) -> Tensor:
         """Predict the Stokes vectors [3, H, W, 3] of a rendered picture.
 
-        By default, surfaces are smooth dielectrics and metals.
+        By default, surfaces are smooth dielectrics and metals. Only this default has a native kernel.
 
         Args:
             result: picture with the specular and diffuse layers and the normal.
             camera: camera of the picture.
         """
         return layer_stokes(result, camera, self.refractive_index)
-
-    @property
-    def radiance_cubemap(self) -> RadianceCubemap | None:
-        """Cubemap of distant light, for relighting and export. None if the model has no such cubemap."""
-        return None
-
-    # Derived from the members above
-
-    @property
-    def reflects(self) -> bool:
-        """True if pictures have a specular layer. In this case, normals are always splatted."""
-        return "specular" in self.layers
-
-    @property
-    def smooth_dielectric(self) -> bool:
-        """True if ``predicted_stokes`` is the default, which has a native kernel."""
-        return type(self).predicted_stokes is ShadingModel.predicted_stokes
-
-    def strength(self, gaussians: Parameters) -> Tensor:
-        """Return the surface property "strength", the reflection strength [N] in [0, 1].
-
-        Raises:
-            PolarguideError: the model has no such property.
-        """
-        for row in self.surface:
-            if row.name == "strength":
-                return row.values(gaussians)
-        raise PolarguideError(
-            "recipe",
-            expected="a shading model with a reflection strength",
-            found=type(self).__name__,
-            remedy='Remove the action "propagate_normals" from the recipe, or add a surface property "strength".',
-        )
 
 
 @dataclass(frozen=True)
@@ -299,6 +236,12 @@ class PlainShading(ShadingModel):
 
 PLAIN = PlainShading()
 """Shading of stages without reflection."""
+
+
+def radiance_cubemap(shading: ShadingModel) -> RadianceCubemap | None:
+    """Return the cubemap of distant light of a model, or None if the model has no such cubemap."""
+    cubemaps = (parameter.radiance for parameter in shading.light_parameters.values())
+    return next((cubemap for cubemap in cubemaps if cubemap is not None), None)
 
 
 def base_colors(gaussians: Parameters, center: Tensor, sh_degree: int) -> Tensor:

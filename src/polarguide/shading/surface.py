@@ -12,6 +12,24 @@ from torch import Tensor
 from polarguide.gaussians.gaussians import Parameters, any_nonzero
 
 
+class RadianceCubemap(NamedTuple):
+    """Parameter of the light that represents radiance from distant surroundings.
+
+    Such light can be exported, rotated and replaced.
+
+    Attributes:
+        name: name of the parameter, raw texels [6, R, R, 3].
+        radiance: function from raw values to linear radiance, [..., 3].
+        raw: inverse of ``radiance``, limited to the range of raw values.
+        note: text about light that does not change when this light is rotated or replaced. Empty if all light changes.
+    """
+
+    name: str
+    radiance: Callable[[Tensor], Tensor]
+    raw: Callable[[Tensor], Tensor]
+    note: str = ""
+
+
 class Parameter(NamedTuple):
     """Description of a tensor that a shading model adds to the training.
 
@@ -19,11 +37,14 @@ class Parameter(NamedTuple):
         shape: shape of the values of one Gaussian, or of the whole tensor for a parameter of the light.
         rate: learning rate of Adam. With 0 the tensor keeps its first values.
         reset_minimum: lower bound of the values after a reset of the opacities. None means no bound.
+        radiance: meaning of a parameter of the light that is a cubemap of distant radiance, for relighting and export.
+            None for all other parameters.
     """
 
     shape: tuple[int, ...]
     rate: float
     reset_minimum: float | None = None
+    radiance: RadianceCubemap | None = None
 
 
 @dataclass(frozen=True)

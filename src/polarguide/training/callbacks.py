@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from polarguide.capture import View
+from polarguide.core.errors import require
 from polarguide.gaussians.densify import DensityStatistics, densify, free_space
 from polarguide.geometry.camera import Camera, seen_at
 from polarguide.geometry.vectors import unit
@@ -59,7 +60,15 @@ def propagate_normals(
     their color alone. Glossy Gaussians grow along their surface.
     """
     gaussians = state.gaussians
-    strength = shading.strength(gaussians)
+    strengths = [row for row in shading.surface if row.name == "strength"]
+    require(
+        strengths,
+        "recipe",
+        expected="a shading model with a reflection strength",
+        found=type(shading).__name__,
+        remedy='Remove the action "propagate_normals" from the recipe, or add a surface property "strength".',
+    )
+    strength = strengths[0].values(gaussians)
     gaussians.overwrite("opacity_logits", gaussians["opacity_logits"].clamp(min=_logit(settings.opacity)))
     # The noise is drawn on the CPU, so that it is the same on every device.
     noise = (torch.rand(gaussians["sh_dc"].shape, generator=generator) * 2 - 1) * settings.color_noise
@@ -306,7 +315,8 @@ class DensityControl(Callback[TrainingLoop]):
         return {"gradient": self._statistics.gradient, "seen": self._statistics.seen}
 
     def load_state_dict(self, tensors: Mapping[str, Tensor]) -> None:
-        self._statistics = DensityStatistics.of(tensors["gradient"], tensors["seen"])
+        self._statistics.gradient = tensors["gradient"]
+        self._statistics.seen = tensors["seen"]
 
     def _prune_untouched(self, loop: TrainingLoop) -> None:
         """Remove Gaussians that contribute too little to the training views.

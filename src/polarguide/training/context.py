@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -76,7 +76,7 @@ class TrainingContext:
     @cached_property
     def shading(self) -> ShadingModel:
         """Shading model of the recipe with the refractive index of the settings."""
-        return self.recipe.shading.bind(self.settings.refractive_index)
+        return replace(self.recipe.shading, refractive_index=self.settings.refractive_index)
 
     @property
     def black(self) -> bool:

@@ -137,40 +137,37 @@ class Feed:
             self._partial = {key: entry for key, entry in self._partial.items() if key[0] == size}
             for kind in KINDS:
                 self._store.drop("small " + kind)
-        if weights.priors and view.is_determined:
+        determined = view.is_determined
+        if weights.priors and determined:
             priors = self._priors(size, view, weights.fields_read)
-        entry = self._store.get(size + "photograph", view.name, lambda: self._photograph(view))
+        entry = self._store.get(size + "photograph", view.name) or self._photograph(size, view)
         valid, empty = (entry[name].codes.float() if name in entry else None for name in ("valid", "empty"))
-        if view.is_determined:
+        if determined:
             return StepTargets(view.camera, stored_values(entry["picture"]), valid, empty, priors=priors)
         if (size, view.name) not in self._partial:
             self._partial[size, view.name] = PartialView.of(view, self._backend.device)
         partial = self._partial[size, view.name]
         return StepTargets(view.camera, partial.shown, valid, empty, partial)
 
-    def _photograph(self, view: View) -> Entry:
-        """Compute the displayed photograph, and masks of its valid and of its empty pixels."""
+    def _photograph(self, size: str, view: View) -> Entry:
+        """Compute and store the displayed photograph, and masks of its valid and of its empty pixels."""
         device = self._backend.device
         entry = {"picture": packed(srgb_encode(view.photograph().clamp(0, 1)).to(device))}
         if bool(view.invalid.any()):
             entry["valid"] = Packed((~view.invalid).to(device))
         if self._context.black:
             entry["empty"] = Packed(empty_pixels(view).to(device))
+        self._store.keep(size + "photograph", view.name, entry)
         return entry
 
     def _priors(self, size: str, view: View, fields: frozenset[str]) -> ViewPriors:
         """Return the priors of a view that determines its Stokes vectors."""
-
-        def make() -> Entry:
+        entry = self._store.get(size + "priors", view.name)
+        if entry is None or not is_complete(entry, fields):  # a stage may read more than the previous one
             self._context.memory.clear()
             entry = self._compute_priors(size, view, fields)
+            self._store.keep(size + "priors", view.name, entry)
             self._context.memory.clear()  # before the rendering, which needs memory as well
-            return entry
-
-        entry = self._store.get(size + "priors", view.name, make)
-        if not is_complete(entry, fields):  # the stage reads more than the previous one
-            self._store.drop(size + "priors", view.name)
-            entry = self._store.get(size + "priors", view.name, make)
         return unpack_priors(entry, view.camera, self._settings)
 
     def _compute_priors(self, size: str, view: View, fields: frozenset[str]) -> Entry:
@@ -178,13 +175,12 @@ class Feed:
         with torch.no_grad():
             normal = render(self.guide, view.camera, rasterize, RenderRequest(sh_degree=0)).normal
         metal = metalness_share(self.guide, view.camera, rasterize)
-
-        def make() -> Entry:
+        entry = self._store.get(size + "unguided", view.name)
+        if entry is None:
             computed = unguided(view.to(normal.device), self._settings, self._index)._asdict()
-            return {name: Packed(values) for name, values in computed.items() if values is not None}
-
-        # Disposable, because recomputing this part is cheap compared to the priors and not worth a file.
-        entry = self._store.get(size + "unguided", view.name, make, disposable=True)
+            entry = {name: Packed(values) for name, values in computed.items() if values is not None}
+            # Disposable, because recomputing this part is cheap compared to the priors and not worth a file.
+            self._store.keep(size + "unguided", view.name, entry, disposable=True)
         precomputed = Unguided(**{name: part.codes for name, part in entry.items()})
         flat = self._flat_surfaces(size).get(view.name)
         indices = index_picture(self.guide, view.camera, rasterize, self._index)

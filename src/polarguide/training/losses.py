@@ -310,6 +310,11 @@ def consistency_loss(result: RenderResult, camera: Camera, weight: Tensor | None
     return (distance if weight is None else weight * distance)[1:-1, 1:-1].mean()
 
 
+def mean_divisor(weight: Tensor, share: float) -> Tensor:
+    """Return the divisor of a weighted mean: the sum of the weights [H, W], but at least a share of the pixels."""
+    return weight.sum().clamp(min=max(1.0, share * weight.numel()))
+
+
 def nearest_target(normal: Tensor, priors: ViewPriors) -> Tensor:
     """Return the target normals [H, W, 3] of the normal term.
 
@@ -336,7 +341,7 @@ def normal_loss(normal: Tensor, priors: ViewPriors) -> Tensor:
         priors: priors of the view.
     """
     cosine = dot(unit(normal, 1e-2), nearest_target(normal, priors))
-    return ((1 - cosine) * priors.weight).sum() / priors.total
+    return ((1 - cosine) * priors.weight).sum() / mean_divisor(priors.weight, priors.azimuth_share)
 
 
 def azimuth_loss(normal: Tensor, priors: ViewPriors) -> Tensor:
@@ -346,7 +351,7 @@ def azimuth_loss(normal: Tensor, priors: ViewPriors) -> Tensor:
     from the DoLP depends on both.
     """
     distance = dot(unit(normal, 1e-2), priors.plane).abs()
-    return (distance * priors.weight).sum() / priors.total
+    return (distance * priors.weight).sum() / mean_divisor(priors.weight, priors.azimuth_share)
 
 
 def chromatic_loss(normal: Tensor, priors: ViewPriors) -> Tensor:
@@ -359,14 +364,15 @@ def chromatic_loss(normal: Tensor, priors: ViewPriors) -> Tensor:
         priors: priors of the view.
     """
     cosine = dot(unit(normal, 1e-2), priors.chromatic)
-    return ((1 - cosine) * priors.chromatic_weight).sum() / priors.chromatic_total
+    divisor = mean_divisor(priors.chromatic_weight, priors.chromatic_share)
+    return ((1 - cosine) * priors.chromatic_weight).sum() / divisor
 
 
 def stokes_loss(result: RenderResult, priors: ViewPriors, shading: ShadingModel) -> Tensor:
     """Return the mean of |predicted - measured| over the square root of S0, for S1 and S2.
 
     The shading model predicts S1 and S2 from the rendered layers and the rendered normal. Geometry and layers therefore
-    have to explain the polarization of all views. ``targets.stokes_weight`` explains the square root.
+    have to explain the polarization of all views. ``priors.stokes_weight`` explains the square root.
 
     Args:
         result: rendering with the specular and diffuse layers and the normal.
@@ -516,29 +522,27 @@ def normal_terms(step: Step, weights: Weights) -> Tensor:
     shading = step.shading
     if not _native_fits(result, priors):
         return normal_terms_reference(step, weights)
+    has_kernel = type(shading).predicted_stokes is ShadingModel.predicted_stokes
     stokes = None
     directions = []
     consistency = None
     further = result.alpha.new_zeros(())
     if priors is not None:
+        total = mean_divisor(priors.weight, priors.azimuth_share)
+        chromatic_total = mean_divisor(priors.chromatic_weight, priors.chromatic_share)
+        target = nearest_target(result.normal, priors)
         directions = [
-            Directions(target, weight, factor / float(total), plane)
-            for factor, target, weight, total, plane in (
-                (weights.normal, nearest_target(result.normal, priors), priors.weight, priors.total, False),
-                (weights.azimuth, priors.plane, priors.weight, priors.total, True),
-                (
-                    weights.chromatic,
-                    priors.chromatic,
-                    priors.chromatic_weight,
-                    priors.chromatic_total,
-                    False,
-                ),
+            Directions(direction, weight, factor / float(divisor), plane)
+            for factor, direction, weight, divisor, plane in (
+                (weights.normal, target, priors.weight, total, False),
+                (weights.azimuth, priors.plane, priors.weight, total, True),
+                (weights.chromatic, priors.chromatic, priors.chromatic_weight, chromatic_total, False),
             )
             if factor
         ]
-        if weights.stokes and shading.reflects and not shading.smooth_dielectric:
+        if weights.stokes and result.is_polarized and not has_kernel:
             further = weights.stokes * stokes_loss(result, priors, shading)
-        elif weights.stokes and shading.reflects:
+        elif weights.stokes and result.is_polarized:
             measured = priors.stokes[1:]
             stokes = PolarizationTerm(
                 measured,
@@ -576,7 +580,7 @@ def normal_terms_reference(step: Step, weights: Weights) -> Tensor:
         ):
             if weight and "normal" in result.layers:
                 total = total + weight * loss(result.normal, priors)
-        if weights.stokes and shading.reflects:
+        if weights.stokes and result.is_polarized:
             total = total + weights.stokes * stokes_loss(result, priors, shading)
     if weights.consistency:
         surface = None if priors is None else priors.surface

@@ -276,16 +276,14 @@ def partial_terms(
         A tuple of the weighted sum of both terms, and the photometric term.
     """
     result = step.result
-    shading = step.shading
 
     def compared(rendered: Tensor) -> Photometric:
         return photometric_terms(rendered, view.shown, step.targets.valid, step.ssim_weight)
 
-    predicts = shading.reflects and result.is_polarized
-    if not (polarization and len(view.intensities) and predicts):
+    if not (polarization and len(view.intensities) and result.is_polarized):
         picture = compared(result.final)
         return photometric * picture.loss, picture
-    stokes = shading.predicted_stokes(result, step.targets.camera)
+    stokes = step.shading.predicted_stokes(result, step.targets.camera)
     picture = compared(result.final if view.mix is None else result.final + behind_analyzer(stokes, view.mix))
     common = 0.0 if view.mix is None else view.mix
     weight = view.reliable * (2 * view.picture.mean(dim=-1) + 0.01).rsqrt()

@@ -31,7 +31,7 @@ from polarguide.capture.exposures import FOUR
 from polarguide.geometry.vectors import dot, unit
 from polarguide.optics.color import srgb_encode
 from polarguide.training.recipe import Candidates, FlatRules, Priors
-from polarguide.training.targets import ViewPriors, stokes_weight, surface_weight
+from polarguide.training.targets import ViewPriors
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,8 +173,10 @@ def unguided(view: View, settings: Priors, refractive_index: float) -> Unguided:
         refractive_index: refractive index of all surfaces.
     """
     stokes = view.stokes()
+    noise: Tensor | float = 0.0
+    if settings.snr and view.exposures == FOUR:  # only redundant pictures allow an estimate of the noise
+        noise = optics.intensity_noise(view.intensities().mean(dim=-1))
     luminance = optics.luminance(stokes)
-    noise = _noise(view) if settings.snr else 0.0
     usable = optics.polarization_mask(
         luminance,
         threshold=settings.threshold,
@@ -256,6 +258,7 @@ def view_priors(
     if by_color is not None:
         nearest_to = torch.where(by_color[1][..., None] > 0, by_color[0], guide.normal)
     candidates = _candidates(settings.candidates, luminance, rays, refractive_index)
+    normals = candidates if isinstance(candidates, Tensor) else candidates.normals
     chosen = optics.disambiguate(candidates, nearest_to, rays, azimuth_weight=settings.azimuth_weight).normal
     layers = _separated(stokes, guide, settings, refractive_index, rays)
     conditioned = layers.conditioned & ~view.saturated
@@ -285,10 +288,36 @@ def view_priors(
         stokes=stokes,
         stokes_weight=stokes_weight(stokes, reliable),
         surface=surface_weight(stokes, weight, settings.bright),
-        candidates=view.camera.to_world(_normals(candidates)) if settings.live else None,
+        candidates=view.camera.to_world(normals) if settings.live else None,
         azimuth_share=settings.azimuth_share,
         chromatic_share=settings.chromatic_share,
     )
+
+
+def stokes_weight(stokes: Tensor, reliable: Tensor) -> Tensor:
+    """Return the weight [H, W] of S1 and S2, which is one over the square root of S0.
+
+    The variance of photon noise is proportional to S0.
+
+    Args:
+        stokes: [3, H, W, 3] measured Stokes vectors.
+        reliable: [H, W] 1 where the measurement is reliable, 0 elsewhere.
+    """
+    return reliable * (stokes[0].mean(dim=-1) + 0.01).rsqrt()
+
+
+def surface_weight(stokes: Tensor, weight: Tensor, bright: float) -> Tensor:
+    """Return the weight [H, W] of the agreement of normals and depth, in [0, 1].
+
+    Args:
+        stokes: [3, H, W, 3] measured Stokes vectors.
+        weight: [H, W] weight of the polarization normal.
+        bright: S0/2 above which the agreement has full weight. With 0, it has the weight of the polarization normal.
+    """
+    if not bright:
+        return weight
+    radiance = optics.luminance(stokes)[0] / 2
+    return torch.maximum(weight, (radiance / bright).clamp(0, 1))
 
 
 def _plane(chosen: Tensor, by_color: tuple[Tensor, Tensor] | None, faint: Tensor, rays: Tensor) -> Tensor:
@@ -411,14 +440,6 @@ def _within(normal: Tensor, guide: Tensor, full: float, none: float) -> Tensor:
     return ((none - angle) / (none - full)).clamp(0, 1)
 
 
-def _noise(view: View) -> Tensor | float:
-    """Return the standard deviation [H, W] of the noise of one of the four intensities.
-
-    Return 0 for views with fewer than four angles, because only redundant pictures allow an estimate of the noise.
-    """
-    return optics.intensity_noise(view.intensities().mean(dim=-1)) if view.exposures == FOUR else 0.0
-
-
 def _candidates(
     kind: Candidates, luminance: Tensor, rays: Tensor, refractive_index: float | Tensor
 ) -> optics.Candidates | optics.PhysicalCandidates | Tensor:
@@ -432,11 +453,6 @@ def _candidates(
     return torch.stack(
         [optics.normal_from_angles(paper.zenith, azimuth, rays) for azimuth in quarters], dim=-2
     )
-
-
-def _normals(candidates: optics.Candidates | optics.PhysicalCandidates | Tensor) -> Tensor:
-    """Return the normals [H, W, K, 3] of candidates."""
-    return candidates if isinstance(candidates, Tensor) else candidates.normals
 
 
 def facing(zenith: Tensor, azimuth: Tensor, guide: Tensor, rays: Tensor) -> Tensor:

@@ -460,7 +460,10 @@ class Recipe:
 
     def data(self) -> dict[str, Any]:
         """Return all values as plain JSON types, for a run folder."""
-        plain: dict[str, Any] = json.loads(json.dumps({**asdict(self), "shading": self.shading.data()}))
+        values = asdict(self)
+        shading = {"model": type(self.shading).__name__, **values["shading"]}
+        del shading["refractive_index"]  # it belongs to the run
+        plain: dict[str, Any] = json.loads(json.dumps({**values, "shading": shading}))
         return plain
 
     def differs(self, data: Mapping[str, Any]) -> bool:

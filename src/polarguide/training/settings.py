@@ -134,8 +134,8 @@ class StepReport:
         step: number of the step, 0-based.
         stage: name of the stage.
         gaussians: number of Gaussians. None for a method without Gaussians.
-        measured: [3] photometric loss, PSNR and total loss, averaged over the views of this rank. The tensor is on the
-            device, so reading its values waits for the device.
+        measured: [3] photometric loss, PSNR and total loss. The tensor is on the device, so that reading its values
+            waits for the device.
         done: number of all finished steps. It includes the steps of earlier schedules, such as a search for angles.
     """
 

@@ -108,20 +108,10 @@ class ViewStore:
         self.in_memory = 0
         self.in_file = 0
 
-    def get(self, kind: str, view: str, make: Callable[[], Entry], *, disposable: bool = False) -> Entry:
-        """Return an entry, and compute it if it is missing.
-
-        Args:
-            kind, view: key of the entry.
-            make: computes the entry.
-            disposable: True to recompute the entry if it is beyond the limit, instead of writing it to the file.
-        """
+    def get(self, kind: str, view: str) -> Entry | None:
+        """Return the entry of a kind and a view, or None if it is missing."""
         key = (kind, view)
-        entry = self._entries.get(key) or self._read(key)
-        if entry is None:
-            entry = make()
-            self._keep(key, entry, disposable)
-        return entry
+        return self._entries.get(key) or self._read(key)
 
     def drop(self, kind: str, view: str | None = None) -> None:
         """Drop all entries of a kind, or the entry of one view.
@@ -130,7 +120,7 @@ class ViewStore:
         slot stays empty. Entries grow only if a stage needs more data than the previous stage.
         """
         for key in [key for key in self._entries if key[0] == kind and view in (None, key[1])]:
-            self.in_memory -= _size(self._entries.pop(key))
+            self.in_memory -= sum(part.bytes for part in self._entries.pop(key).values())
         for key, slot in self._slots.items():
             if key[0] == kind and view in (None, key[1]):
                 slot.length = 0
@@ -144,8 +134,17 @@ class ViewStore:
             self._file.close()
             self._file = None
 
-    def _keep(self, key: tuple[str, str], entry: Entry, disposable: bool) -> None:
-        size = _size(entry)
+    def keep(self, kind: str, view: str, entry: Entry, *, disposable: bool = False) -> None:
+        """Store an entry in place of an earlier one.
+
+        Args:
+            kind, view: key of the entry.
+            entry: the entry.
+            disposable: True to discard the entry if it is beyond the limit, instead of writing it to the file.
+        """
+        self.drop(kind, view)
+        key = (kind, view)
+        size = sum(part.bytes for part in entry.values())
         if self._limit is None or self.in_memory + size <= self._limit:
             self._entries[key] = entry
             self.in_memory += size
@@ -190,7 +189,3 @@ class ViewStore:
         if len(data) < slot.length:
             return None
         return {name: Packed(codes, slot.tops[name]) for name, codes in load(data).items()}
-
-
-def _size(entry: Entry) -> int:
-    return sum(part.bytes for part in entry.values())

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import torch
 from torch import Tensor
 
-from polarguide import optics
 from polarguide.capture import View
 from polarguide.capture.exposures import analyzers, radiance_places
 from polarguide.gaussians.gaussians import Parameters
@@ -36,8 +34,8 @@ class ViewPriors:
         chromatic: [H, W, 3] normal from the polarization of color differences or of a flat surface, world axes.
         chromatic_weight: [H, W] weight of ``chromatic``, in [0, 1]; 0 if the settings do not request this normal.
         stokes: [3, H, W, 3] measured Stokes vectors.
-        stokes_weight: [H, W] weight of S1 and S2, see ``stokes_weight``.
-        surface: [H, W] weight of the agreement of normals and depth, see ``surface_weight``.
+        stokes_weight: [H, W] weight of S1 and S2, see ``priors.stokes_weight``.
+        surface: [H, W] weight of the agreement of normals and depth, see ``priors.surface_weight``.
         candidates: [H, W, K, 3] normals from which each step chooses in place of ``normal``, world axes. None if
             ``normal`` is used.
         azimuth_share, chromatic_share: least share of the pixels by which sums of the terms on directions are divided.
@@ -58,46 +56,6 @@ class ViewPriors:
     candidates: Tensor | None = None
     azimuth_share: float = 0.0
     chromatic_share: float = 0.0
-
-    @cached_property
-    def total(self) -> Tensor:
-        """Divisor of means with ``weight``: the sum of the weights, but at least ``azimuth_share`` of all pixels."""
-        return _total(self.weight, self.azimuth_share)
-
-    @cached_property
-    def chromatic_total(self) -> Tensor:
-        """Divisor of means with ``chromatic_weight``: its sum, but at least ``chromatic_share`` of all pixels."""
-        return _total(self.chromatic_weight, self.chromatic_share)
-
-
-def _total(weight: Tensor, share: float) -> Tensor:
-    return weight.sum().clamp(min=max(1.0, share * weight.numel()))
-
-
-def stokes_weight(stokes: Tensor, reliable: Tensor) -> Tensor:
-    """Return the weight [H, W] of S1 and S2, which is one over the square root of S0.
-
-    The variance of photon noise is proportional to S0.
-
-    Args:
-        stokes: [3, H, W, 3] measured Stokes vectors.
-        reliable: [H, W] 1 where the measurement is reliable, 0 elsewhere.
-    """
-    return reliable * (stokes[0].mean(dim=-1) + 0.01).rsqrt()
-
-
-def surface_weight(stokes: Tensor, weight: Tensor, bright: float) -> Tensor:
-    """Return the weight [H, W] of the agreement of normals and depth, in [0, 1].
-
-    Args:
-        stokes: [3, H, W, 3] measured Stokes vectors.
-        weight: [H, W] weight of the polarization normal.
-        bright: S0/2 above which the agreement has full weight. With 0, it has the weight of the polarization normal.
-    """
-    if not bright:
-        return weight
-    radiance = optics.luminance(stokes)[0] / 2
-    return torch.maximum(weight, (radiance / bright).clamp(0, 1))
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,7 +17,7 @@ from polarguide.raster.interface import Rasterize
 from polarguide.results.rendering.relight import RELIT_RESOLUTION, turned_cubemap
 from polarguide.runs.opened import OpenedRun
 from polarguide.shading.gbuffer import RenderRequest, render
-from polarguide.shading.model import PLAIN, Light, Parameters, ShadingModel
+from polarguide.shading.model import PLAIN, Light, Parameters, ShadingModel, radiance_cubemap
 from polarguide.shading.result import POLARIZED, RenderResult, polarized_layers
 from polarguide.training.loop import TrainingLoop
 from polarguide.viewer.cameras import drawn_camera, letterboxed
@@ -96,7 +96,7 @@ class Scenery:
         return self.shading.predicted_stokes(result, camera)
 
     def _turned(self, turn: Tensor) -> Light:
-        cubemap = self.shading.radiance_cubemap
+        cubemap = radiance_cubemap(self.shading)
         if cubemap is None:
             return self.light
         turned = turned_cubemap(self.light[cubemap.name].detach(), turn, RELIT_RESOLUTION)

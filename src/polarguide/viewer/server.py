@@ -34,7 +34,7 @@ from polarguide.geometry.scene_frame import scene_frame
 from polarguide.runs.model import layers_of
 from polarguide.runs.opened import OpenedRun
 from polarguide.runs.train import Ends, Look
-from polarguide.shading.model import ShadingModel
+from polarguide.shading.model import ShadingModel, radiance_cubemap
 from polarguide.training.loop import TrainingLoop
 from polarguide.viewer.cameras import Photograph, photographs
 from polarguide.viewer.guard import Accepts, Gate, checked_message, guarded
@@ -104,7 +104,7 @@ class Viewer:
         self._photographs = photographs
         self._beside = beside
         self._scene_frame = scene_frame([photograph.view.camera for photograph in photographs.values()])
-        turns = shading.radiance_cubemap is not None
+        turns = radiance_cubemap(shading) is not None
         others = visitors.allow_host or visitors.allow_origin
         self._save = save if host in LOOPBACK and not others else None
         saves = self._save is not None

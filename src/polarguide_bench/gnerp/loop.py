@@ -20,7 +20,7 @@ from polarguide.optics.color import srgb_encode
 from polarguide.training.callback import Loop
 from polarguide.training.settings import ResolvedSettings
 from polarguide.training.state import seeded
-from polarguide.training.storage import Entry, Packed, ViewStore, packed, stored_values
+from polarguide.training.storage import Packed, ViewStore, packed, stored_values
 from polarguide_bench.gnerp.march import RaySamples, march
 from polarguide_bench.gnerp.recipe import NeuralRecipe
 from polarguide_bench.gnerp.state import FieldState
@@ -139,18 +139,17 @@ class Target:
 
 def target_of(view: View, store: ViewStore, device: torch.device) -> Target:
     """Return the target of a view from a cache. The cache stores two bytes per value."""
-
-    def make() -> Entry:
-        entry = {"picture": packed(srgb_encode(view.photograph().clamp(0, 1)).to(device))}
+    stored = store.get("target", view.name)
+    if stored is None:
+        stored = {"picture": packed(srgb_encode(view.photograph().clamp(0, 1)).to(device))}
         if bool(view.invalid.any()):
-            entry["valid"] = Packed((~view.invalid).to(device))
+            stored["valid"] = Packed((~view.invalid).to(device))
         if view.is_determined:
             gray = luminance(view.stokes())
             degree = dolp(gray) * ~(view.saturated | view.invalid)
-            entry["dolp"], entry["aolp"] = packed(degree.to(device)), packed(aolp(gray).to(device))
-        return entry
-
-    stored = store.get("target", view.name, make)
+            stored["dolp"] = packed(degree.to(device))
+            stored["aolp"] = packed(aolp(gray).to(device))
+        store.keep("target", view.name, stored)
     picture = stored_values(stored["picture"]).view(-1, 3)
     zeros = torch.zeros(len(picture), device=device)
     degree, angle = (

@@ -35,6 +35,7 @@ from polarguide.results.rendering.mesh import ColoredMesh, Surface
 from polarguide.results.rendering.relight import mirrored_light
 from polarguide.results.rendering.subject import subject_of
 from polarguide.shading.deferred import DeferredShading
+from polarguide.shading.model import radiance_cubemap
 from polarguide.shading.result import RenderResult
 
 trimesh = pytest.importorskip("trimesh")
@@ -241,7 +242,7 @@ def ball_view(camera: Camera, mirrored: float = 1.0) -> RenderResult:
 
 def ball_run(light: float = 1.0) -> Any:
     """What exports read of a run, of the sphere; ``light`` is the radiance that it has learned."""
-    shading = DeferredShading(blend="fresnel", environment_resolution=4).bind(1.5)
+    shading = DeferredShading(blend="fresnel", environment_resolution=4)
     model = SimpleNamespace(shading=shading, state=SimpleNamespace(gaussians={}))
     frame = scene_frame(list(CAMERAS.values()))
     views = [SimpleNamespace(camera=camera) for camera in CAMERAS.values()]
@@ -324,7 +325,7 @@ def test_nothing_is_whiter_than_surfaces_are(tmp_path: Path) -> None:
 def test_light_that_gaussians_add_is_folded_in() -> None:
     """The learned light is 0.2 everywhere, and what the sphere mirrors is 3; where it mirrors nothing, 0.2 stays."""
     run = ball_run(3.0)
-    cubemap = run.model.shading.radiance_cubemap
+    cubemap = radiance_cubemap(run.model.shading)
     run.light["texels"] = torch.full((6, 4, 4, 3), math.log(0.2))
     found = [cubemap.radiance(mirrored_light(run, cubemap, lambda *_: None))]
     run.result = lambda camera: ball_view(camera).with_layers(

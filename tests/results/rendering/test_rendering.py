@@ -38,7 +38,7 @@ from polarguide.results.rendering.relight import (
 from polarguide.shading.cubemap import cubemap_lookup, texel_directions
 from polarguide.shading.deferred import DeferredShading
 from polarguide.shading.directional import DirectionalShading
-from polarguide.shading.model import PLAIN
+from polarguide.shading.model import PLAIN, radiance_cubemap
 from polarguide.shading.result import RenderResult
 
 AROUND = scene_frame(list(ring().values()))
@@ -54,15 +54,15 @@ def smooth_texels(resolution: int = 32) -> torch.Tensor:
 @pytest.mark.parametrize("shading", [LERP, FRESNEL])
 def test_a_panorama_becomes_the_light_it_was(shading: DeferredShading) -> None:
     texels = smooth_texels()
-    picture = panorama(texels, shading.radiance_cubemap, AROUND, 256)
-    back = cubemap_of_panorama(picture, shading.radiance_cubemap, AROUND, 32)
+    picture = panorama(texels, radiance_cubemap(shading), AROUND, 256)
+    back = cubemap_of_panorama(picture, radiance_cubemap(shading), AROUND, 32)
     torch.testing.assert_close(shading.radiance(back), shading.radiance(texels), atol=0.01, rtol=0.01)
 
 
 def test_a_panorama_is_upright_and_runs_to_the_right() -> None:
     axes = AROUND.panorama_axes().float()
     texels = texel_directions(32) @ axes  # light = (right, up, back)
-    picture = panorama(texels, FRESNEL.radiance_cubemap, AROUND, 64).log()
+    picture = panorama(texels, radiance_cubemap(FRESNEL), AROUND, 64).log()
     right, up, back = picture.unbind(-1)
     assert float(up[0].mean()) > 0.99
     assert float(up[-1].mean()) < -0.99
@@ -133,7 +133,7 @@ def test_an_exr_is_written_under_a_name_that_is_no_utf8(tmp_path: Path) -> None:
 def test_recipes_without_radiance_say_so() -> None:
     for shading in (DirectionalShading(), PLAIN):
         Fault("--environment", "radiance").raised_by(needs_radiance, shading, what="--environment")
-    assert needs_radiance(FRESNEL, what="") == FRESNEL.radiance_cubemap
+    assert needs_radiance(FRESNEL, what="") == radiance_cubemap(FRESNEL)
 
 
 trimesh = pytest.importorskip("trimesh")

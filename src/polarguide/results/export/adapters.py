@@ -20,7 +20,7 @@ from polarguide.gaussians.harmonics import SH_C0
 from polarguide.optics import reflectances_from_cosine
 from polarguide.shading.cubemap import box_mips
 from polarguide.shading.deferred import LOCAL_NOTE, DeferredShading
-from polarguide.shading.directional import DirectionalShading, albedo_of
+from polarguide.shading.directional import DirectionalShading
 from polarguide.shading.model import Light, PlainShading, ShadingModel
 from polarguide.shading.roughness import ggx_alpha, gltf_roughness
 from polarguide.shading.surface import surface_channels
@@ -78,18 +78,6 @@ def _(shading: DeferredShading, gaussians: Parameters) -> dict[str, Tensor]:
     if "index" in own:
         fields["refractive_index"] = shading.refractive_index + gaussians["index_offset"]
     return fields
-
-
-@ply_fields.register
-def _(shading: DirectionalShading, gaussians: Parameters) -> dict[str, Tensor]:
-    """Return ``albedo``, ``roughness``, ``feature``, ``surface``, and harmonics for a ``surface`` of 0."""
-    return {
-        **ply_fields.dispatch(ShadingModel)(shading, gaussians),
-        "albedo": albedo_of(gaussians),
-        "roughness": torch.sigmoid(gaussians["roughness_logits"]),
-        "feature": torch.tanh(gaussians["features"]),
-        "surface": gaussians["surface"],
-    }
 
 
 @singledispatch

@@ -64,6 +64,7 @@ from polarguide.results.rendering.relight import (
 )
 from polarguide.runs.model import write_run_ply
 from polarguide.runs.opened import OpenedRun
+from polarguide.shading.model import radiance_cubemap
 from polarguide.visualization import figures
 
 RECORD = "model.json"
@@ -79,11 +80,6 @@ FILES = {
     "environment.png": "the same as a picture",
     "preview.png": "a view of the run as a picture",
 }
-
-
-def about_files(names: list[str]) -> dict[str, str]:
-    """Return a description of each file by name."""
-    return {name: FILES[name] for name in names}
 
 
 def package_record(run: OpenedRun, placement: Placement, origin: Origin, base_color: str) -> dict[str, Any]:
@@ -342,7 +338,7 @@ class _Exporter:
         """
         run = self.run
         lit = replace(self.options, unlit=False)
-        radiant = run.model.shading.radiance_cubemap is not None
+        radiant = radiance_cubemap(run.model.shading) is not None
         if not radiant and lit.base_color is None:
             lit = replace(lit, base_color="diffuse")
         with atomic_folder(self.folder) as parts:
@@ -362,7 +358,8 @@ class _Exporter:
             placement = self.presented.upright(run)
             meaning = BASE_COLORS[lit.resolved_base_color]
             record = package_record(run, placement, self.presented.origin, meaning)
-            write_text(parts / RECORD, json.dumps({**record, "files": about_files(names)}, indent=1) + "\n")
+            record["files"] = {name: FILES[name] for name in names}
+            write_text(parts / RECORD, json.dumps(record, indent=1) + "\n")
         return [self.folder / name for name in [RECORD, *names]]
 
     def environment(self) -> list[Path]:

@@ -27,7 +27,7 @@ from polarguide.geometry.scene_frame import SceneFrame
 from polarguide.geometry.vectors import unit
 from polarguide.runs.opened import OpenedRun
 from polarguide.shading.cubemap import cubemap_lookup, texel_directions
-from polarguide.shading.model import RadianceCubemap, ShadingModel, mirrored
+from polarguide.shading.model import RadianceCubemap, ShadingModel, mirrored, radiance_cubemap
 
 LARGEST = 8192 * 4096
 RELIT_RESOLUTION = 128
@@ -75,13 +75,15 @@ def needs_radiance(shading: ShadingModel, *, what: str) -> RadianceCubemap:
     Raises:
         PolarguideError: the model has no light, or its light is not a cubemap of radiance.
     """
-    cubemap = shading.radiance_cubemap
+    cubemap = radiance_cubemap(shading)
     if cubemap is not None:
         return cubemap
     raise PolarguideError(
         what,
         expected="a recipe that learns the radiance of its surroundings",
-        found="a recipe with another kind of light" if shading.reflects else "a run without reflection",
+        found="a recipe with another kind of light"
+        if "specular" in shading.layers
+        else "a run without reflection",
         remedy="Choose a run of 3dgs-dr, polarguide or polarguide-stokes.",
     )
 

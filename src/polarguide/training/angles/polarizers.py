@@ -446,7 +446,7 @@ def predicts_filters(recipe: Recipe) -> bool:
 
     Such a recipe renders S0, S1 and S2.
     """
-    return recipe.shading.reflects and any(stage.weights.stokes > 0 for stage in recipe.stages)
+    return "specular" in recipe.shading.layers and any(stage.weights.stokes > 0 for stage in recipe.stages)
 
 
 def search_steps(recipe: Recipe, settings: ResolvedSettings) -> int:

@@ -46,16 +46,6 @@ class ViewSamples(NamedTuple):
     cosine: Tensor
 
 
-def view_sums(
-    gaussians: Parameters, views: Iterable[View], rasterize: Rasterize, limits: MetalViews
-) -> list[Tensor]:
-    """Return, for each view, sums [N, 11] over the pixels of each Gaussian.
-
-    ``samples_of`` converts these sums to means. Every view has to determine the Stokes vector.
-    """
-    return [_look(gaussians, view, rasterize, limits.least_normal) for view in views]
-
-
 def evenly(views: Sequence[View], most: int) -> Sequence[View]:
     """Return at most ``most`` evenly spread views."""
     return views[:: max(1, -(-len(views) // most))]
@@ -71,11 +61,11 @@ def shares(gaussians: Parameters, camera: Camera, target: Tensor, rasterize: Ras
         return torch.autograd.grad(total, features)[0]
 
 
-def _look(gaussians: Parameters, view: View, rasterize: Rasterize, least_normal: float) -> Tensor:
-    """Return sums [N, 11] over the pixels of each Gaussian in a view.
+def view_sums(gaussians: Parameters, view: View, rasterize: Rasterize, least_normal: float) -> Tensor:
+    """Return sums [N, 11] over the pixels of each Gaussian in a view, which has to determine the Stokes vector.
 
-    The columns are 1, S0 (three colors), P (three), the polarization at 45 degrees (three), and the cosine of the
-    zenith.
+    ``samples_of`` converts these sums to means. The columns are 1, S0 (three colors), P (three), the polarization at 45
+    degrees (three), and the cosine of the zenith.
     """
     device = gaussians["means"].device
     normal = render(gaussians, view.camera, rasterize, RenderRequest(sh_degree=0)).normal

@@ -53,7 +53,7 @@ from polarguide.optics.fresnel import reflectances_from_cosine
 from polarguide.raster import Rasterize
 from polarguide.shading.gbuffer import render
 from polarguide.shading.metal import FIRST_REFLECTANCE, become_metal
-from polarguide.shading.model import Light, Parameters, ShadingModel
+from polarguide.shading.model import Light, Parameters, ShadingModel, radiance_cubemap
 from polarguide.training.context import TrainingContext
 from polarguide.training.metals.observations import (
     LEAST_PIXELS,
@@ -188,7 +188,7 @@ def evidence(
         none = labels.new_zeros(len(labels))
         gray = labels.new_full((len(labels), 3), FIRST_REFLECTANCE)
         return MetalEvidence(none, none, gray, torch.zeros_like(gray), labels)
-    looks = view_sums(gaussians, memory.between(measured), rasterize, limits)
+    looks = [view_sums(gaussians, view, rasterize, limits.least_normal) for view in memory.between(measured)]
     result = of_views(looks, labels, refractive_index, rules, limits)
     del looks
     memory.clear()
@@ -391,11 +391,9 @@ def light_gain(
     ratio = torch.cat(ratios) if ratios else gaussians["means"].new_zeros(0)
     if not len(ratio) or len(ratio) < limits.gain_pixels * pixels:
         return 1.0
-    body = gaussians["metalness"] == 0
-    smallest = (
-        torch.quantile(shading.strength(gaussians)[body], 0.9) if bool(body.any()) else ratio.new_tensor(0.1)
-    )
-    return float(ratio.median().exp().clamp(min=float(smallest), max=limits.most_gain))
+    strengths = torch.sigmoid(gaussians["strength_logits"])[gaussians["metalness"] == 0]
+    smallest = float(torch.quantile(strengths, 0.9)) if len(strengths) else 0.1
+    return float(ratio.median().exp().clamp(min=smallest, max=limits.most_gain))
 
 
 class MetalSearch:
@@ -436,7 +434,7 @@ class MetalSearch:
         gain = partial(
             light_gain, gaussians, state.light, determined, rasterize, context.shading, limits, context.memory
         )
-        cubemap = context.shading.radiance_cubemap
+        cubemap = radiance_cubemap(context.shading)
         if cubemap is not None:
             become_metal(gaussians, state.light[cubemap.name], cubemap.radiance, metal, reflectance, gain)
         del measured
