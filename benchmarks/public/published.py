@@ -100,6 +100,22 @@ def find_captures(folder: Path, name: str) -> list[Path]:
     return captures[:1] if captures[0] == folder else captures
 
 
+def check_recipes(recipes: Sequence[str]) -> None:
+    """Check that the recipes have at least two columns in the table of PolarGuide-GSDR.
+
+    Raises:
+        PolarguideError: there are fewer columns.
+    """
+    columns = [*LAYOUT.columns.values()]
+    require(
+        len({*recipes} & {*columns}) >= 2,
+        "--recipes",
+        expected="at least two of " + ", ".join(columns),
+        found=" ".join(recipes),
+        remedy="Add recipes of the table. Other recipes are possible, but the table leaves them out.",
+    )
+
+
 def published_sections(results: Results, name: str) -> list[Section]:
     """Return the tables: measured scores, published scores of the same captures, and their conditions."""
     dataset = PUBLISHED_DATASETS[name]
@@ -169,6 +185,7 @@ def parsed() -> argparse.Namespace:
 
 def main() -> None:
     options = parsed()
+    check_recipes(options.recipes)
     dataset = PUBLISHED_DATASETS[options.dataset]
     reporter = PrintingReporter()
     scenes = []

@@ -35,6 +35,25 @@ def test_other_datasets_and_missing_folders_are_refused(tmp_path: Path) -> None:
     )
 
 
+@pytest.mark.parametrize("recipes", [["3dgs"], ["3dgs", "3dgs"], ["3dgs", "polarguide"]])
+def test_too_few_recipes_are_refused_before_the_training(recipes: list[str]) -> None:
+    Fault("--recipes", "at least two of gnerp, 3dgs", " ".join(recipes), "Add recipes").raised_by(
+        published.check_recipes, recipes
+    )
+
+
+@pytest.mark.parametrize(
+    "arguments", [["owl"], ["pandora", "x"], ["pandora", "x", "--out", "y", "--steps", "many"]]
+)
+def test_wrong_arguments_end_with_the_usage(
+    arguments: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["published.py", *arguments])
+    with pytest.raises(SystemExit):
+        published.main()
+    assert "usage: published.py" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("name", published.PUBLISHED_DATASETS)
 def test_measured_scores_are_next_to_published_ones(name: str) -> None:
     scored = [run(CAPTURES[name], recipe, 0, psnr=20.125, ssim=0.8) for recipe in ("3dgs", "3dgs-dr")]
