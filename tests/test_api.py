@@ -20,7 +20,7 @@ from trainings import Reports, different
 import polarguide
 from polarguide.core.options import SceneOptions, SessionOptions
 from polarguide.core.progress import Advance
-from polarguide.results.evaluation.record import validate_metrics
+from polarguide.results.evaluation.evaluate import validate_metrics
 from polarguide.runs.folder import CHECKPOINT, CONFIGURATION, PLY
 from polarguide.shading.result import LAYERS, POLARIZED
 from polarguide.training.loop import TrainingLoop

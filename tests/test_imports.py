@@ -215,7 +215,7 @@ def test_upward_and_outside_imports_are_fine(package):
     source = package(
         {
             "polarguide/__init__.py": "__version__ = '1'",
-            "polarguide/cli/run.py": "\n".join(cli),
+            "polarguide/cli/runs.py": "\n".join(cli),
             "polarguide/optics/stokes.py": "\n".join(stokes),
             "polarguide/optics/frames.py": "\n".join(frames),
         }

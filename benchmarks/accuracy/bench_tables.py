@@ -1,7 +1,7 @@
-"""Write short Markdown tables of a bench's records: rows by scene, gain by polarization, and errors by object.
+"""Print the tables of a bench's records: losses, means over scenes, gain by polarization, scenes and objects.
 
-The tables of polarguide bench and polarguide tables contain every metric. These tables contain the nine metrics of the
-documentation. The records have the same code and options, with one or more scenes each.
+The losses against recipes without polarization are first. The tables of polarguide compare and polarguide tables
+contain every metric. These tables contain the metrics of the documentation. A column without any value is left out.
 
     python benchmarks/accuracy/bench_tables.py benchmarks/results/bench/*.json > tables.md
 """
@@ -11,53 +11,52 @@ from __future__ import annotations
 import argparse
 import math
 import statistics
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
-import msgspec
+from bench_records import (
+    BY_KEY,
+    Rows,
+    Scenes,
+    Value,
+    by_scene,
+    code_versions,
+    objects_of,
+    of_material,
+    of_object,
+    of_run,
+    read_scenes,
+    values,
+)
+from losses import LAYERS, NORMALS, bad_views, gain_table, loss_tables, without_polarization
 from scipy import stats
 
 from polarguide.core.errors import PolarguideError
-from polarguide.results.evaluation.table import METRICS, OBJECT_METRICS
-from polarguide_bench.results import read_results
+from polarguide.results.evaluation.table import OBJECT_METRICS
 
-BY_KEY = {metric.key: metric for metric in METRICS}
 COLUMNS = {
     "psnr": "PSNR",
+    "psnr_seen": "PSNR of seen pixels",
     "psnr_foreground": "foreground",
+    "ssim": "SSIM",
+    "lpips": "LPIPS",
+    "flip": "FLIP",
     "normal_mae_deg": "normal error (deg)",
     "specular_psnr": "specular PSNR",
     "diffuse_psnr": "diffuse PSNR",
+    "specular_psnr_dielectric": "specular PSNR without metals",
+    "diffuse_psnr_dielectric": "diffuse PSNR without metals",
     "stokes_error": "Stokes error",
     "depth_error_median_percent": "depth error (%)",
     "depth_beyond": "depth beyond (%)",
     "mesh_fscore_1": "mesh F-score 1 % (%)",
+    "fps": "frames per second",
+    "train_seconds": "training (s)",
 }
-WITHOUT_METALS = {
-    "specular_psnr_dielectric": "specular PSNR without metals",
-    "diffuse_psnr_dielectric": "diffuse PSNR without metals",
-}
-RECIPE, BASELINE = "polarguide-stokes", "3dgs-dr"
+"""Heading of each metric in the tables of scenes and means."""
+RECIPE = "polarguide-stokes"
+BASELINE = "3dgs-dr"
 CONTROLS = (f"{RECIPE}:unpolarized", f"{RECIPE}:unpolarized-without-consistency")
-Value = Callable[[Any], float | None]
-Seeds = Mapping[int, Any]
-Rows = Mapping[str, Seeds]
-
-
-def values(seeds: Seeds, value: Value) -> dict[int, float]:
-    """Return the values of a metric by seed, for seeds with a value."""
-    return {seed: found for seed, run in seeds.items() if (found := value(run)) is not None}
-
-
-def of_run(key: str) -> Value:
-    """Return a function that reads a metric of a run."""
-    return lambda run: run["metrics"].get(key)
-
-
-def of_object(name: str, key: str) -> Value:
-    """Return a function that reads a metric of an object of a run."""
-    return lambda run: run["objects"].get(name, {"metrics": {}})["metrics"].get(key)
 
 
 def number(key: str, known: list[float]) -> str:
@@ -100,31 +99,32 @@ def gain(key: str, rows: Rows) -> str:
 
 def scene_table(rows: Rows) -> Iterator[str]:
     """Yield a table of all recipes of a scene."""
-    shown = [key for key in COLUMNS if any(values(seeds, of_run(key)) for seeds in rows.values())]
-    yield f"| recipe | {' | '.join(COLUMNS[key] for key in shown)} | seeds |"
-    yield f"|---|{'---:|' * (len(shown) + 1)}"
+    columns = shown_columns({"": rows})
+    yield f"| recipe | {' | '.join(columns.values())} | seeds |"
+    yield f"|---|{'---:|' * (len(columns) + 1)}"
     for name, seeds in rows.items():
-        cells = (number(key, list(values(seeds, of_run(key)).values())) for key in shown)
+        cells = (number(key, list(values(seeds, of_run(key)).values())) for key in columns)
         yield f"| `{name}` | {' | '.join(cells)} | {len(seeds)} |"
 
 
-def mean_table(scenes: Mapping[str, Rows]) -> Iterator[str]:
+def mean_table(scenes: Scenes) -> Iterator[str]:
     """Yield a table of all recipes over all scenes with equal weights. Each column has the scenes of all recipes."""
     names = dict.fromkeys(name for rows in scenes.values() for name in rows)
-    yield f"| recipe | {' | '.join(COLUMNS.values())} |"
-    yield f"|---|{'---:|' * len(COLUMNS)}"
+    columns = shown_columns(scenes)
+    yield f"| recipe | {' | '.join(columns.values())} |"
+    yield f"|---|{'---:|' * len(columns)}"
     for name in names:
         cells = []
-        for key in COLUMNS:
+        for key in columns:
             of_scene = [list(values(rows.get(name, {}), of_run(key)).values()) for rows in scenes.values()]
             known = all(of_scene)
             cells.append(number(key, [statistics.fmean(map(statistics.fmean, of_scene))] if known else []))
         yield f"| `{name}` | {' | '.join(cells)} |"
 
 
-def gain_table(scenes: Mapping[str, Rows]) -> Iterator[str]:
+def control_table(scenes: Scenes) -> Iterator[str]:
     """Yield a table of the gain by polarization on each scene."""
-    columns = {**COLUMNS, **WITHOUT_METALS}
+    columns = {key: heading for key, heading in shown_columns(scenes).items() if not BY_KEY[key].timed}
     yield f"| scene | {' | '.join(columns.values())} |"
     yield f"|---|{'---|' * len(columns)}"
     for scene, rows in scenes.items():
@@ -132,11 +132,26 @@ def gain_table(scenes: Mapping[str, Rows]) -> Iterator[str]:
             yield f"| `{scene}` | {' | '.join(gain(key, rows) for key in columns)} |"
 
 
+def material_table(scenes: Scenes) -> Iterator[str]:
+    """Yield a table of the materials: means over scenes of the baseline, the first control, and the recipe."""
+    keys = (*NORMALS, *LAYERS)
+    parts = [part for rows in scenes.values() if RECIPE in rows for part in objects_of(rows, RECIPE).values()]
+    yield f"| material | {' | '.join(COLUMNS[key] for key in keys)} |"
+    yield f"|---|{'---|' * len(keys)}"
+    for material in dict.fromkeys(part["material"] for part in parts):
+        cells = []
+        for key in keys:
+            value = of_material(material, key)
+            means = [by_scene(scenes, recipe, value).values() for recipe in (BASELINE, CONTROLS[0], RECIPE)]
+            cells.append(" / ".join(number(key, [statistics.fmean(of)] if of else []) for of in means))
+        yield f"| {material} | {' | '.join(cells)} |"
+
+
 def object_table(rows: Rows) -> Iterator[str]:
     """Yield a table of the objects of a scene: the baseline, the better of the controls, and the recipe."""
     yield f"| object | material | {' | '.join(BY_KEY[key].heading for key in OBJECT_METRICS)} |"
     yield f"|---|---|{'---|' * len(OBJECT_METRICS)}"
-    for name, part in next(iter(rows[RECIPE].values()))["objects"].items():
+    for name, part in objects_of(rows, RECIPE).items():
         cells = []
         for key in OBJECT_METRICS:
             value = of_object(name, key)
@@ -147,21 +162,31 @@ def object_table(rows: Rows) -> Iterator[str]:
         yield f"| {name} | {part['material']} | {' | '.join(cells)} |"
 
 
-def read_scenes(paths: list[Path]) -> dict[str, dict[str, dict[int, Any]]]:
-    """Return the finished runs of all records by scene, recipe and seed, in the order of the records.
+def shown_columns(scenes: Scenes) -> dict[str, str]:
+    """Return the columns in which any run has a value."""
+    runs = [run for rows in scenes.values() for seeds in rows.values() for run in seeds.values()]
+    return {
+        key: heading for key, heading in COLUMNS.items() if any(of_run(key)(run) is not None for run in runs)
+    }
 
-    Raises:
-        PolarguideError: a file is not a record.
+
+def tables(scenes: Scenes, others: Sequence[str]) -> Iterator[str]:
+    """Yield all tables. Losses are counted against the recipes ``others``, which have no polarization.
+
+    Scenes without runs of the default recipe have only tables of means.
     """
-    scenes: dict[str, dict[str, dict[int, Any]]] = {}
-    for path in paths:
-        record = msgspec.to_builtins(read_results(path))
-        for recipe in record["recipes"]:
-            for run in record["runs"]:
-                if run["recipe"] == recipe["name"] and run["state"] == "done":
-                    rows = scenes.setdefault(run["scene"], {})
-                    rows.setdefault(run["recipe"], {})[run["seed"]] = run
-    return scenes
+    ours = {scene: rows for scene, rows in scenes.items() if RECIPE in rows}
+    if ours:
+        yield from ("## Losses\n", *loss_tables(ours, RECIPE, others))
+        yield from ("\n## Mean gains\n", *gain_table(ours, RECIPE, others))
+        yield from ("\n## By material\n", *material_table(ours))
+        yield from ("\n## Gain by polarization\n", *control_table(ours))
+    yield from ("\n## Mean over scenes\n", *mean_table(scenes))
+    for scene, rows in scenes.items():
+        yield from (f"\n## {scene}\n", *scene_table(rows), "")
+        if scene in ours:
+            yield from object_table(rows)
+            yield from ("", *(f"- {line}" for line in bad_views(scene, rows, RECIPE, others)))
 
 
 def main() -> None:
@@ -169,17 +194,18 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("records", type=Path, nargs="+", help="results.json of polarguide bench or compare")
+    parser.add_argument(
+        "--against", nargs="+", default=without_polarization(RECIPE), help="recipes without polarization"
+    )
     options = parser.parse_args()
     try:
         scenes = read_scenes(options.records)
+        versions = code_versions(options.records)
     except PolarguideError as error:
         parser.error(str(error))
-    print("## Mean over scenes\n", *mean_table(scenes), sep="\n", end="\n\n")
-    print("## Gain by polarization\n", *gain_table(scenes), sep="\n", end="\n\n")
-    for scene, rows in scenes.items():
-        print(f"## {scene}\n", *scene_table(rows), sep="\n", end="\n\n")
-        if RECIPE in rows:
-            print(*object_table(rows), sep="\n", end="\n\n")
+    comparable = "" if len(versions) == 1 else " Values of different versions are not comparable."
+    print(f"Version of the code: {', '.join(versions)}.{comparable}\n")
+    print(*tables(scenes, options.against), sep="\n")
 
 
 if __name__ == "__main__":

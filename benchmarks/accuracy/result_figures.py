@@ -1,7 +1,6 @@
-"""Draw figures and short tables of docs/results from the records in benchmarks/results.
+"""Draw the figures docs/figures/results-*.svg from the records in benchmarks/results.
 
-    python benchmarks/accuracy/result_figures.py            # draws docs/figures/results-*.svg
-    python benchmarks/accuracy/result_figures.py --tables   # prints the same values as Markdown
+    python benchmarks/accuracy/result_figures.py
 
 The figures show quality by recipe, by material, by number of views and by polarizer angles of each view. Each point is
 one scene, the mean of its seeds. No record varies the noise of the pictures.
@@ -9,23 +8,22 @@ one scene, the mean of its seeds. No record varies the noise of the pictures.
 
 from __future__ import annotations
 
-import argparse
 import json
 import statistics
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
-from bench_tables import BY_KEY, Rows, Value, of_run, read_scenes, values
+from bench_records import BY_KEY, Scenes, by_scene, of_material, of_run, read_scenes
 from matplotlib import pyplot
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 ROOT = Path(__file__).resolve().parents[2]
 RECORDS, FIGURES = ROOT / "benchmarks" / "results", ROOT / "docs" / "figures"
-BENCH = sorted(p for p in (RECORDS / "bench").glob("*.json") if p.name != "faster-geometry.json")
-"""The eleven scenes of the bench. faster-geometry.json has other rows, of an earlier commit."""
+BENCH = sorted((RECORDS / "bench").glob("*.json"))
+"""The eleven scenes of the bench."""
 BASELINE = "3dgs-dr"
 RECIPES = (
     "3dgs",
@@ -57,33 +55,6 @@ STYLE = {
     "grid.linewidth": 0.6,
     "axes.axisbelow": True,
 }
-Scenes = Mapping[str, Rows]
-
-
-def by_scene(scenes: Scenes, recipe: str, value: Value) -> dict[str, float]:
-    """Return the mean over seeds of a recipe by scene. Scenes without a value are left out."""
-    means = {scene: list(values(rows.get(recipe, {}), value).values()) for scene, rows in scenes.items()}
-    return {scene: statistics.fmean(known) for scene, known in means.items() if known}
-
-
-def of_material(name: str, key: str) -> Value:
-    """Return a function that reads a metric over the pixels of a material in a run."""
-    return lambda run: (run["materials"] or {}).get(name, {"metrics": {}})["metrics"].get(key)
-
-
-def table(
-    corner: str, keys: Sequence[str], rows: Mapping[str, Callable[[str], Mapping[str, float]]]
-) -> Iterator[str]:
-    """Yield a Markdown table of means over scenes, with a row for each function of the metric."""
-    yield f"| {corner} | {' | '.join(BY_KEY[key].heading for key in keys)} |"
-    yield f"|---|{'---:|' * len(keys)}"
-    for name, value in rows.items():
-        cells = []
-        for key in keys:
-            known = list(value(key).values())
-            mean = BY_KEY[key].factor * statistics.fmean(known) if known else None
-            cells.append("n/a" if mean is None else f"{mean:.{BY_KEY[key].digits}f}")
-        yield f"| {name} | {' | '.join(cells)} |"
 
 
 def panels(keys: Sequence[str], height: float, **options: Any) -> tuple[Figure, list[Axes]]:
@@ -204,42 +175,9 @@ def draw_constants(scenes: Mapping[str, Mapping[str, Mapping[str, float]]]) -> N
     save(figure, "metals")
 
 
-def tables(bench: Scenes, angles: Scenes) -> Iterator[str]:
-    """Yield the values of the figures by recipe, material and angles as Markdown."""
-    keys = (*PICTURE, *NORMALS, *DIELECTRIC)
-    yield "## By recipe\n"
-    every = (BASELINE, *RECIPES)
-    yield from table(
-        "recipe", keys, {f"`{name}`": lambda k, name=name: by_scene(bench, name, of_run(k)) for name in every}
-    )
-    yield "\n## By material\n"
-    cells = {
-        f"{material}, `{name}`": lambda k, name=name, material=material: by_scene(
-            bench, name, of_material(material, k)
-        )
-        for material in MATERIALS
-        for name in THREE
-    }
-    yield from table("material, recipe", (*NORMALS, *LAYERS), cells)
-    yield "\n## By angles\n"
-    keys = (*PICTURE, *NORMALS, *LAYERS, "stokes_error")
-    yield from table(
-        "angles",
-        keys,
-        {f"`{words}`": lambda k, words=words: by_scene(angles, words, of_run(k)) for words in ANGLES},
-    )
-
-
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--tables", action="store_true", help="print the values, and draw nothing")
-    options = parser.parse_args()
-    bench, angles = read_scenes(BENCH), read_scenes([RECORDS / "exposures.json"])
-    if options.tables:
-        print(*tables(bench, angles), sep="\n")
-        return
+    bench = read_scenes(BENCH)
+    angles = read_scenes([RECORDS / "exposures.json"])
     views = read_scenes([RECORDS / "cup-views.json"])
     mpl.use("svg")
     mpl.rcParams.update(STYLE)

@@ -24,7 +24,7 @@ import torch
 import polarguide as pg
 from polarguide.methods import recipe_named
 from polarguide.methods.baselines import RESET
-from polarguide.results.evaluation.record import read_metrics
+from polarguide.results.evaluation.evaluate import read_metrics
 from polarguide.shading.deferred import DeferredShading
 from polarguide.shading.directional import DirectionalShading
 from polarguide.training.recipe import Recipe, Stage, Weights

@@ -31,8 +31,7 @@ from polarguide.capture.view import View
 from polarguide.methods import recipe_named
 from polarguide.raster import choose_backend
 from polarguide.runs.folder import resolve
-from polarguide.training.angles.fits import gaussian_training
-from polarguide.training.angles.polarizers import Judgment
+from polarguide.training.angles.polarizers import Judgment, gaussian_training
 from polarguide.training.context import TrainingContext
 from polarguide.training.recipe import Recipe
 from polarguide.training.settings import TrainSettings

@@ -16,13 +16,12 @@ from polarguide.optics.color import srgb_encode
 from polarguide.raster import Backend, ScreenStatistic, Splats
 from polarguide.runs.folder import resolve
 from polarguide.shading.gbuffer import RenderRequest, render
-from polarguide.training.angles.fits import gaussian_training
-from polarguide.training.context import TrainingContext
+from polarguide.training.angles.polarizers import gaussian_training
+from polarguide.training.context import TrainingContext, TrainingState
 from polarguide.training.losses import Weights
 from polarguide.training.photometric import photometric_loss
 from polarguide.training.recipe import Recipe
 from polarguide.training.settings import TrainSettings
-from polarguide.training.state import TrainingState
 
 STEPS, BEGIN = 1_000_000, 300_000  # in stage 2 of polarguide, with all harmonics
 

@@ -28,10 +28,9 @@ from polarguide.raster.cuda import has_gsplat
 from polarguide.results.evaluation.metrics import psnr
 from polarguide.runs.folder import CHECKPOINT, load_checkpoint, resolve, save_checkpoint
 from polarguide.shading.gbuffer import render
-from polarguide.training.angles.fits import gaussian_training
-from polarguide.training.context import TrainingContext
+from polarguide.training.angles.polarizers import gaussian_training
+from polarguide.training.context import TrainingContext, TrainingState
 from polarguide.training.settings import TrainSettings
-from polarguide.training.state import TrainingState
 
 RECIPE = RECIPES["polarguide"]
 

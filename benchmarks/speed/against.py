@@ -50,7 +50,7 @@ except ImportError:
     from polarguide.training.trainer import TrainSettings
 
 try:
-    from polarguide.training.angles.fits import gaussian_training
+    from polarguide.training.angles.polarizers import gaussian_training
     from polarguide.training.context import TrainingContext
     def Trainer(*inputs):
         return gaussian_training(TrainingContext(*inputs))[0]

@@ -28,7 +28,7 @@ from polarguide.gaussians.gaussians import Trained
 from polarguide.methods import recipe_named
 from polarguide.raster import choose_backend, use_threads
 from polarguide.runs.folder import CONFIGURATION, load_checkpoint, resolve
-from polarguide.training.angles.fits import gaussian_training
+from polarguide.training.angles.polarizers import gaussian_training
 from polarguide.training.context import TrainingContext
 from polarguide.training.feed import Feed
 from polarguide.training.loop import TrainingLoop

@@ -25,7 +25,7 @@ from polarguide.capture import Scene, load_scene
 from polarguide.methods import RECIPES
 from polarguide.raster import choose_backend
 from polarguide.runs.folder import resolve
-from polarguide.training.angles.fits import gaussian_training
+from polarguide.training.angles.polarizers import gaussian_training
 from polarguide.training.context import TrainingContext
 from polarguide.training.recipe import Recipe, Stage
 from polarguide.training.settings import TrainSettings

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from polarguide_shots.calibration.settings import CalibrateSettings
     from polarguide_shots.exposures import find_shots
     from polarguide_shots.maps import ShotMaps
-    from polarguide_shots.measurement.watch import watch_folder
+    from polarguide_shots.measurement.line import watch_folder
     from polarguide_shots.options import MeasureOptions, ShotOptions, WatchOptions
     from polarguide_shots.read import SurfaceMaps, read_shot, surface_maps
 
@@ -59,7 +59,7 @@ _NAMES = {
     "polarguide_shots.calibration.settings": ("CalibrateSettings",),
     "polarguide_shots.exposures": ("find_shots",),
     "polarguide_shots.maps": ("ShotMaps",),
-    "polarguide_shots.measurement.watch": ("watch_folder",),
+    "polarguide_shots.measurement.line": ("watch_folder",),
     "polarguide_shots.options": ("MeasureOptions", "ShotOptions", "WatchOptions"),
     "polarguide_shots.read": ("SurfaceMaps", "read_shot", "surface_maps"),
 }

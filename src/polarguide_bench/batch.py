@@ -17,10 +17,10 @@ from polarguide.core.errors import PolarguideError, require
 from polarguide.core.files import check_out, make_folder, require_inside, write_text
 from polarguide.core.options import ComputeOptions, PathLike
 from polarguide.core.progress import SILENT, Reporter
-from polarguide.inspection.report import FILE as INSPECTION_PAGE
+from polarguide.inspection.inspect import FILE as INSPECTION_PAGE
 from polarguide.methods import recipe_named
 from polarguide.raster import choose_backend
-from polarguide.results.evaluation.record import read_metrics
+from polarguide.results.evaluation.evaluate import read_metrics
 from polarguide.results.evaluation.table import COLUMNS
 from polarguide.runs.folder import CHECKPOINT, RunConfiguration
 from polarguide.visualization.pages import page

@@ -32,7 +32,7 @@ from polarguide.core.progress import Reporter, notebook_reporter
 from polarguide.core.records import decode
 from polarguide.core.system import only_writer
 from polarguide.raster import choose_backend
-from polarguide.results.evaluation.record import code_digest, commit
+from polarguide.results.evaluation.evaluate import code_digest, commit
 from polarguide.results.evaluation.table import COLUMNS, PART_METRICS, Metric, register_metric
 from polarguide.training.settings import TrainSettings
 from polarguide_bench.children import Scoring, Task, Training

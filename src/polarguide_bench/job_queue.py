@@ -21,7 +21,7 @@ from polarguide.core.errors import PolarguideError, optional_import, require
 from polarguide.core.options import LOOPBACK
 from polarguide.core.progress import Advance, Reporter
 from polarguide.core.system import MEBIBYTE
-from polarguide.results.evaluation.record import code_digest
+from polarguide.results.evaluation.evaluate import code_digest
 from polarguide.runs.folder import CHECKPOINT, RunLog
 from polarguide_bench.children import (
     POLL_SECONDS,

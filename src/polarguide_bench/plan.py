@@ -28,7 +28,7 @@ from polarguide.core.options import DeviceName, Exposures, SceneOptions, index_o
 from polarguide.core.progress import SILENT, Reporter
 from polarguide.core.system import free_memory
 from polarguide.raster import Backend
-from polarguide.results.evaluation.record import PACKAGE, _digest, code_digest, read_metrics
+from polarguide.results.evaluation.evaluate import PACKAGE, _digest, code_digest, read_metrics
 from polarguide.results.evaluation.table import registered_digests
 from polarguide.results.evaluation.target import SceneFacts
 from polarguide.runs.folder import CHECKPOINT, CONFIGURATION, PLY, RunConfiguration, most_gaussians

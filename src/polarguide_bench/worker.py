@@ -25,13 +25,11 @@ from polarguide.core.files import make_folder
 from polarguide.core.options import SessionOptions
 from polarguide.core.records import decode
 from polarguide.core.system import StopSignals, keep_freed_memory
-from polarguide.inspection.inspect import inspect_scene
-from polarguide.inspection.report import write_inspection
+from polarguide.inspection.inspect import inspect_scene, write_inspection
 from polarguide.inspection.settings import InspectSettings
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.raster import choose_backend, use_threads
-from polarguide.results.evaluation.evaluate import evaluate
-from polarguide.results.evaluation.record import code_digest
+from polarguide.results.evaluation.evaluate import code_digest, evaluate
 from polarguide.results.export import formats, web_page
 from polarguide.runs.folder import CONFIGURATION, writing_to
 from polarguide.runs.opened import OpenedRun

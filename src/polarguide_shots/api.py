@@ -14,11 +14,12 @@ from polarguide.core.errors import PolarguideError
 from polarguide.core.files import read_file
 from polarguide.core.options import PathLike, SceneOptions, index_of
 from polarguide.core.progress import SILENT, Reporter
-from polarguide.results.rendering.pictures import views_named, write_priors
+from polarguide.results.rendering.pictures import views_named
 from polarguide.runs.opened import OpenedRun, read_scene
 from polarguide_shots.calibration.calibrate import calibrate_sensor
 from polarguide_shots.measurement.line import measure_shots
 from polarguide_shots.options import ShotOptions
+from polarguide_shots.prior_pictures import write_priors
 from polarguide_shots.sets import known_indices
 from polarguide_shots.write import FORMATS, WrittenShots, check_formats, write_shots, write_view_maps
 
@@ -49,7 +50,7 @@ def priors(
     Args:
         scene: a scene with poses, or its folder.
         out: folder to write.
-        run: trained run of the scene, as in ``results.rendering.pictures.write_priors``.
+        run: trained run of the scene, as in ``polarguide_shots.prior_pictures.write_priors``.
         views: views to write, as in ``write_priors``.
         refractive_index: refractive index of the surfaces. If None, the value in ``scene.json`` is used, or else 1.5.
         threshold: smallest DoLP of a used normal, as in ``write_priors``.

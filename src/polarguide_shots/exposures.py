@@ -8,10 +8,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from polarguide.capture.exposure_files import list_shot_files, one_of_each_shot, shot_stem
 from polarguide.capture.exposures import TABLE
 from polarguide.capture.filter import shots as filter_shots
-from polarguide.capture.filter.consecutive import VIDEO_SUFFIXES
+from polarguide.capture.filter.shots import VIDEO_SUFFIXES
 from polarguide.capture.layout import (
     CaptureFiles,
     angle_folders,
@@ -19,9 +18,12 @@ from polarguide.capture.layout import (
     describe_contents,
     find_layout,
     list_files,
+    list_shot_files,
+    one_of_each_shot,
+    shot_stem,
 )
+from polarguide.capture.sensor.mosaics import RAW_SUFFIXES
 from polarguide.capture.sensor.pattern import SENSOR_NAMES
-from polarguide.capture.sensor.raw_file import RAW_SUFFIXES
 from polarguide.capture.view import ANGLES
 from polarguide.core.errors import PolarguideError, require
 from polarguide.core.text import canonical

@@ -16,32 +16,22 @@ from torch import Tensor
 from polarguide import optics
 from polarguide.capture import checks
 from polarguide.capture.brackets import SINGLE, Bracket, bracket_notes
-from polarguide.capture.calibration import UNIT_GAINS, oriented, pair_ratio
+from polarguide.capture.calibration import UNIT_GAINS, apply_orientation, as_displayed, oriented, pair_ratio
 from polarguide.capture.colmap.model import fit_camera, read_model
-from polarguide.capture.develop import (
-    BracketedShots,
-    LinearShots,
-    MosaicFiles,
-    as_displayed,
-    calibration_of,
-    levels_of_shot,
-    pair_gains,
-    sample_blocks,
-)
-from polarguide.capture.exposure_files import all_exposures
+from polarguide.capture.develop import BracketedShots, LinearShots, moved_shots, pair_gains
 from polarguide.capture.exposures import FOUR, Angle, normalized
-from polarguide.capture.filter.camera_files import apply_orientation
-from polarguide.capture.filter.develop import moved_shots
 from polarguide.capture.filter.encoding import transfer_of_pictures
 from polarguide.capture.filter.shots import _READ, require_four_shots, stacked
 from polarguide.capture.layout import (
     KEPT,
     READ,
+    all_exposures,
     find_layout,
     require_memory_of_each,
     select_views,
 )
 from polarguide.capture.sensor.demosaic import DEMOSAIC_MODES, defects, defects_note, demosaic, spoiled
+from polarguide.capture.sensor.mosaics import MosaicFiles, calibration_of, sample_blocks
 from polarguide.capture.sensor.pattern import (
     SIDE,
     Levels,
@@ -79,6 +69,7 @@ from polarguide_shots.options import ShotOptions
 from polarguide_shots.samples import (
     SetSamples,
     behind_lens,
+    levels_of_shot,
     read_set,
     samples_of_arrays,
     samples_of_loaded,

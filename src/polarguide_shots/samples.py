@@ -15,18 +15,18 @@ from torch import Tensor
 
 from polarguide.capture import checks
 from polarguide.capture.brackets import Bracket
-from polarguide.capture.calibration import ANGLES, Calibration
-from polarguide.capture.develop import COMPARABLE, levels_of_shot, require_one, stated_exposures
+from polarguide.capture.calibration import ANGLES, Calibration, apply_orientation, orientation_calibration
+from polarguide.capture.develop import COMPARABLE, require_one, stated_exposures
 from polarguide.capture.exposures import Angle, Exposure, analyzers, turned
-from polarguide.capture.filter.camera_files import apply_orientation, orientation_calibration
 from polarguide.capture.filter.encoding import VIDEO, kind_of_file, transfer_of_pictures
 from polarguide.capture.filter.shots import Shots, read_stack, stacked
-from polarguide.capture.formats.headers import rescaled
 from polarguide.capture.formats.pictures import linear_codes
+from polarguide.capture.formats.stored import require_alike, rescaled
 from polarguide.capture.layout import require_memory
 from polarguide.capture.picture_sets import Mask, SetSamples
+from polarguide.capture.sensor.pattern import FULL_16, Levels, estimate_levels, level_notes
 from polarguide.capture.view import FULL_CODE, View
-from polarguide.capture.view_reader import ViewData, require_alike
+from polarguide.capture.view_reader import ViewData
 from polarguide.core.errors import require
 from polarguide_shots.options import ShotOptions
 from polarguide_shots.sets import SetPicture, known_indices, read_frames
@@ -358,3 +358,45 @@ def stated_of_shot(paths: Sequence[Path]) -> tuple[list[float], list[str]]:
     exposures = stated[""]
     factor = max(exposures) / min(exposures)
     return exposures, [f"The files state exposures that differ by a factor of {factor:.3g}; corrected."]
+
+
+def levels_of_shot(
+    values: NDArray[Any],
+    container: int,
+    options: ShotOptions,
+    *,
+    bits: int | None,
+    black: float = 0.0,
+    stated: int | None = None,
+) -> tuple[Levels, list[str]]:
+    """Estimate the levels (such as full scale) of the stored values of a single shot.
+
+    If many samples have the same largest value, they are saturated. This value does not become the full scale, because
+    all shots of a series must have the same full scale.
+
+    Args:
+        values: stored values, [K, ...].
+        container: see ``capture.develop.levels_of_capture``.
+        options: see ``capture.develop.levels_of_capture``.
+        bits: number of bits of a sensor value, or None if it is unknown.
+        black: see ``capture.develop.levels_of_capture``.
+        stated: see ``capture.develop.levels_of_capture``.
+
+    Returns:
+        The levels, and notes for the user.
+
+    Raises:
+        PolarguideError: a value exceeds ``--bits``, or ``--saturation`` is out of range.
+    """
+    largest = int(values.max())
+    counts = None
+    # Clipped values are a power of two minus 1. This test avoids the slow counting of all values.
+    may_pile_up = container == 16 and largest < FULL_16 and largest & (largest + 1) == 0
+    if may_pile_up and options.bits is None and options.saturation is None:
+        parts = (np.bincount(part.ravel(), minlength=FULL_16 + 1) for part in values)
+        counts = sum(parts, np.zeros(1, np.int64))
+    levels = estimate_levels(
+        largest, int(np.bitwise_or.reduce(values, None)), container,
+        bits=bits, black=black, saturation=options.saturation, counts=counts, stated=stated, alone=True,
+    )  # fmt: skip
+    return levels, level_notes(levels, counts, container, bits, stated)

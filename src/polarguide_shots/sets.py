@@ -11,7 +11,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polarguide.capture.exposure_files import all_exposures, exposure_tables, list_shot_files, shot_stem
 from polarguide.capture.exposures import (
     FEWEST,
     LARGEST,
@@ -28,15 +27,15 @@ from polarguide.capture.exposures import (
     normalized,
     parse_angle,
 )
-from polarguide.capture.filter.consecutive import VIDEO_SUFFIXES
 from polarguide.capture.filter.shots import (
     SHOT_SUFFIXES,
+    VIDEO_SUFFIXES,
     angle_order,
     group_files,
     listed_pictures,
     views_of_names,
 )
-from polarguide.capture.layout import ambiguous
+from polarguide.capture.layout import all_exposures, ambiguous, exposure_tables, list_shot_files, shot_stem
 from polarguide.capture.view import ANGLES, listed
 from polarguide.core.errors import PolarguideError, require
 from polarguide.core.files import read_rows, require_file

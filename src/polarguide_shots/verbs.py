@@ -68,7 +68,7 @@ def measure(
         line = importlib.import_module("polarguide_shots.measurement.line")
         outcome = line.measure_shots(paths, out, options, reading, heard=heard, reporter=ConsoleReporter())
     else:
-        watch = importlib.import_module("polarguide_shots.measurement.watch")
+        watch = importlib.import_module("polarguide_shots.measurement.line")
         with StopSignals() as should_stop:
             outcome = watch.watch_folder(
                 watching.watch, out, options, reading, watching,

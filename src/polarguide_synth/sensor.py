@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from polarguide.capture.filter.camera_files import INVERSE, apply_orientation, orientation_calibration
+from polarguide.capture.calibration import INVERSE, apply_orientation, orientation_calibration
 from polarguide.capture.sensor.pattern import sensor_pattern, tiled
 from polarguide.geometry.camera import Camera
 from polarguide.geometry.polarizer import malus

@@ -23,7 +23,7 @@ from polarguide.core import progress
 from polarguide.core.progress import NotebookReporter, notebook_reporter
 from polarguide.methods import registry
 from polarguide.results.evaluation import table
-from polarguide.results.evaluation.record import read_metrics
+from polarguide.results.evaluation.evaluate import read_metrics
 from polarguide.training.losses import Weights, term
 from polarguide_bench.children import Definitions
 from polarguide_bench.figures import read_curve, training_curves, write_figures

@@ -14,8 +14,7 @@ from heard import Heard
 import polarguide
 from polarguide.core.options import SceneOptions
 from polarguide.methods import RECIPES, recipe_named
-from polarguide.results.evaluation.evaluate import evaluate
-from polarguide.results.evaluation.record import code_digest
+from polarguide.results.evaluation.evaluate import code_digest, evaluate
 from polarguide.runs.opened import OpenedRun
 from polarguide.training.settings import TrainSettings
 from polarguide_bench import plan as plans

@@ -27,9 +27,8 @@ from PIL import Image
 from polarguide.capture.brackets import Bracket, Radiance, measure_exposures
 from polarguide.capture.brackets import merge as merge_measured
 from polarguide.capture.develop import light_of_files
-from polarguide.capture.exposure_files import exposure_name, list_shot_files
 from polarguide.capture.formats.pictures import linear_codes
-from polarguide.capture.layout import SHARE, find_layout
+from polarguide.capture.layout import SHARE, exposure_name, find_layout, list_shot_files
 from polarguide.capture.point_exposures import PointSamples
 from polarguide.capture.view_reader import StoredViews, ViewData, read_view
 from polarguide.core.progress import Reporter
@@ -38,9 +37,9 @@ from polarguide.inspection.capture import read_capture
 from polarguide.inspection.inspect import measure_view
 from polarguide.inspection.picture_checks import light_checks
 from polarguide.preparation import filter_source
-from polarguide.preparation.journal import ExposureRecord
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import PrepareSettings
+from polarguide.preparation.source import ExposureRecord
 from polarguide_shots.exposures import find_shots
 from polarguide_shots.options import ShotOptions
 from polarguide_shots.read import read_shot

@@ -15,14 +15,8 @@ import pytest
 from faults import Fault
 
 from polarguide.capture.datasets.readers import open_dataset
-from polarguide.capture.formats.headers import declared_size, find_damage
-from polarguide.capture.formats.pictures import (
-    decode_arrays,
-    decode_stored,
-    read_array,
-    read_arrays,
-    read_radiance,
-)
+from polarguide.capture.formats.pictures import decode_arrays, read_array, read_arrays, read_radiance
+from polarguide.capture.formats.stored import declared_size, decode_stored, find_damage
 from polarguide.capture.metadata import objects_of
 from polarguide.capture.pose_files import read_pose_file
 

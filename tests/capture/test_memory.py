@@ -17,10 +17,9 @@ from hostile_files import deflated_tiff, exr, header, two_sizes_hdr
 from tiny_capture import NAMES, TinyCapture, write_tiny_capture
 
 from polarguide.capture import load_scene, view_reader
-from polarguide.capture.develop import WORKED
-from polarguide.capture.formats.headers import declared_size
-from polarguide.capture.formats.pictures import decode_stored, read_picture, stated_size
+from polarguide.capture.formats.stored import declared_size, decode_stored, read_picture, stated_size
 from polarguide.capture.layout import KEPT, READ, SHARE
+from polarguide.capture.sensor.mosaics import WORKED
 from polarguide.core.system import free_memory
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import PrepareSettings

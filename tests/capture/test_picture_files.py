@@ -21,9 +21,8 @@ from tiny_capture import TinyCapture, encode_srgb, ideal_intensities, write_pict
 
 from polarguide.capture import load_scene
 from polarguide.capture.filter.camera_files import exif_data, orientation
-from polarguide.capture.formats import pictures
-from polarguide.capture.formats.headers import declared_size, find_damage
 from polarguide.capture.formats.pictures import decode_picture, linear_codes
+from polarguide.capture.formats.stored import declared_size, decode_stored, find_damage
 from polarguide.capture.view import FULL_CODE
 from polarguide.capture.write import intensity_codes, rounding_of, write_png_file
 from polarguide.geometry.polarizer import ANGLES
@@ -250,7 +249,7 @@ def test_bmp_variants(tmp_path: Path, bits: int, options: dict[str, range], shap
     head = struct.pack("<IiiHHIIiiII", 40, 30, 20, 1, bits, 0, 0, 0, 0, 0, 0)
     data = struct.pack("<2sIHHI", b"BM", 0, 0, 0, 54 + len(palette)) + head + palette + rows.tobytes()
     expected = stored[..., :3] if channels > 1 else np.array(levels, np.uint8)[stored]
-    found = pictures.decode_stored(tmp_path / "a.bmp", data)
+    found = decode_stored(tmp_path / "a.bmp", data)
     assert (found.shape, declared_size(data)) == (shape, (30, 20))
     np.testing.assert_array_equal(found, expected)
     for length in (20, 60, len(data) - 1):
@@ -266,7 +265,7 @@ def test_pgm_and_ppm_keep_their_numbers(tmp_path: Path, kind: bytes, channels: i
         np.uint8 if full < 256 else ">u2"
     )
     data = b"%s\n# a comment\n30 20\n%d\n" % (kind, full) + stored.tobytes()
-    found = pictures.decode_stored(tmp_path / "a.pgm", data)
+    found = decode_stored(tmp_path / "a.pgm", data)
     np.testing.assert_array_equal(found, stored[..., ::-1] if channels == 3 else stored[..., 0])
     assert "cut short" in str(find_damage(data[:-1]))
 
@@ -373,15 +372,15 @@ def test_mask_of_another_size_or_damaged(capture: TinyCapture, folder: str) -> N
 
 def test_a_lack_of_memory_is_told_from_damage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     data = cv2.imencode(".png", np.zeros((40, 50), np.uint16))[1].tobytes()
-    monkeypatch.setattr(pictures.cv2, "imdecode", lambda *_: None)
-    Fault(found="one that cannot be decoded").raised_by(pictures.decode_stored, tmp_path / "a.png", data)
+    monkeypatch.setattr(cv2, "imdecode", lambda *_: None)
+    Fault(found="one that cannot be decoded").raised_by(decode_stored, tmp_path / "a.png", data)
 
     def none_left(*_: object) -> None:
         raise MemoryError
 
-    monkeypatch.setattr(pictures.np, "empty", none_left)
+    monkeypatch.setattr(np, "empty", none_left)
     Fault(expected="memory for a picture of 50x40 pixels", found="less").raised_by(
-        pictures.decode_stored, tmp_path / "a.png", data
+        decode_stored, tmp_path / "a.png", data
     )
 
 

@@ -10,8 +10,15 @@ import pytest
 from camera_files import COLOR, MONO, behind, busy_light, mosaic, pack, smooth_light, write_mosaic
 from faults import Fault
 
-from polarguide.capture.develop import sample_blocks
 from polarguide.capture.sensor.demosaic import DEMOSAIC_MODES, DemosaicedPicture, demosaic
+from polarguide.capture.sensor.mosaics import (
+    PACKINGS,
+    RawFormat,
+    packed_size,
+    read_mosaic,
+    sample_blocks,
+    unpack,
+)
 from polarguide.capture.sensor.pattern import (
     SENSORS,
     SIDE,
@@ -21,7 +28,6 @@ from polarguide.capture.sensor.pattern import (
     sensor_pattern,
     unusable_samples,
 )
-from polarguide.capture.sensor.raw_file import PACKINGS, RawFormat, packed_size, read_mosaic, unpack
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import PrepareSettings
 from polarguide_shots.calibration.settings import CalibrateSettings

@@ -20,15 +20,9 @@ import pytest
 from camera_files import ANGLES, behind, read_invalid, read_polar, smooth_light
 from faults import Fault
 
-from polarguide.capture.calibration import Calibration
+from polarguide.capture.calibration import Calibration, apply_orientation, orientation_calibration
 from polarguide.capture.exposures import Angle, angle_labels, split_name, turned
-from polarguide.capture.filter.camera_files import (
-    apply_orientation,
-    exif_data,
-    orientation_calibration,
-    read_camera_raw,
-    read_exposure_data,
-)
+from polarguide.capture.filter.camera_files import exif_data, read_camera_raw, read_exposure_data
 from polarguide.geometry.polarizer import malus
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import PrepareSettings

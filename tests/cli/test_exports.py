@@ -24,9 +24,9 @@ from polarguide.core import errors
 from polarguide.core.errors import PolarguideWarning, install_package
 from polarguide.gaussians.ply import read_ply
 from polarguide.geometry.camera import seen_at
-from polarguide.geometry.trajectory import camera_record
-from polarguide.results.rendering.film import path_cameras
-from polarguide.results.rendering.subject import subject_of
+from polarguide.geometry.scene_frame import camera_record
+from polarguide.results.rendering.mesh import subject_of
+from polarguide.results.rendering.pictures import path_cameras
 from polarguide.runs.folder import CHECKPOINT, CONFIGURATION
 
 ONE = ("--threads", "1")

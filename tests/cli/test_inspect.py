@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from polarguide.cli.app import run
-from polarguide.inspection.report import LAYERS
+from polarguide.inspection.inspect import LAYERS
 
 VOID = {"meta", "input", "img", "br"}
 

@@ -16,7 +16,7 @@ from safetensors.torch import load_file
 import polarguide
 from polarguide.cli.app import run
 from polarguide.optics.color import srgb_decode
-from polarguide.results.evaluation.record import validate_metrics
+from polarguide.results.evaluation.evaluate import validate_metrics
 from polarguide.runs.folder import CHECKPOINT, CONFIGURATION, LOG, PLY
 from polarguide.training.loop import TrainingLoop
 from polarguide.training.settings import StepReport

@@ -16,8 +16,8 @@ import polarguide
 from polarguide.capture.presentation import PRESENTATION_FILE, Crop, Presentation, read_presentation
 from polarguide.cli.app import run
 from polarguide.gaussians.ply import read_ply
-from polarguide.results.rendering import picking
-from polarguide.results.rendering.film import path_cameras
+from polarguide.results.rendering import present as presenting
+from polarguide.results.rendering.pictures import path_cameras
 
 ONE = ("--threads", "1")
 
@@ -75,7 +75,7 @@ def test_a_scene_s_holds_for_its_runs_which_may_have_others(
 def test_white_is_picked_in_a_photograph_or_is_their_mean(scene: Path) -> None:
     view = polarguide.load_scene(scene, views=["v000"]).views[0]
     gains = torch.tensor(present(scene, "--white-balance", "v000,60.5,80.5").white_balance)
-    color = picking.photograph_color(view, 60.5, 80.5)
+    color = presenting.photograph_color(view, 60.5, 80.5)
     torch.testing.assert_close(color * gains, color[1].expand(3))
     views = polarguide.load_scene(scene).train_views
     gains = torch.tensor(present(scene, "--white-balance", "gray").white_balance)
@@ -92,10 +92,10 @@ def test_scale_from_two_points(copy: Path, scene: Path, monkeypatch: pytest.Monk
     for folder in (copy, scene):
         found = present(folder, "--points", "v000", "v003", "--distance", "2m").meters_per_unit
         assert found == pytest.approx(2 / apart)
-    monkeypatch.setattr(picking, "LEAST_ALPHA", 0.0)  # nothing is opaque yet
+    monkeypatch.setattr(presenting, "LEAST_ALPHA", 0.0)  # nothing is opaque yet
     trained = polarguide.open_run(copy, device="cpu")
     result, camera = trained.result("v000"), cameras["v000"]
-    places = [picking.surface_at(result, camera, x, y) for x, y in ((5.5, 12.5), (25.5, 12.5))]
+    places = [presenting.surface_at(result, camera, x, y) for x, y in ((5.5, 12.5), (25.5, 12.5))]
     apart = float((places[0].point - places[1].point).norm())
     found = present(copy, "--points", "v000,5.5,12.5", "v000,25.5,12.5", "--distance", "1in").meters_per_unit
     assert found == pytest.approx(0.0254 / apart, rel=1e-4)

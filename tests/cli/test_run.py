@@ -13,7 +13,7 @@ import pytest
 from camera_files import behind, busy_light, write_mosaics, write_picture
 
 from polarguide.cli import app
-from polarguide.cli.run import _is_current
+from polarguide.cli.runs import _is_current
 
 Refused = Callable[..., str]
 VIEWS = 6
@@ -71,7 +71,7 @@ def test_a_capture_is_recognized_and_its_commands_are_printed(
 ) -> None:
     called: list[list[str]] = []
     monkeypatch.setattr(app, "call", lambda verb, words: called.append([*words]))
-    monkeypatch.setattr("polarguide.cli.run._verdict", lambda folder: "ok")
+    monkeypatch.setattr("polarguide.cli.runs._verdict", lambda folder: "ok")
     monkeypatch.chdir(tmp_path)
     source = make(tmp_path / "My mug")
     own_call("run", ["run", source.name, *options, "--steps", "9", "--open", "--threads", "1"])

@@ -10,7 +10,7 @@ from polarguide.gaussians.gaussians import Gaussians
 from polarguide.geometry.camera import Camera, look_at
 from polarguide.methods import RECIPES
 from polarguide.shading.model import ShadingModel
-from polarguide.training.state import Environment, TrainingState
+from polarguide.training.context import Environment, TrainingState
 
 KINDS = {"3dgs": "plain", "3dgs-dr": "reflection", "polarguide-stokes": "local", "ref-gs": "directional"}
 """A recipe for each kind of shading."""

@@ -6,8 +6,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from polarguide.geometry.camera import Camera
-from polarguide.geometry.vectors import unit
+from polarguide.geometry.camera import Camera, unit
 from polarguide.methods import RECIPES
 from polarguide.shading.model import (
     Channels,

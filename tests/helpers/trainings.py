@@ -9,13 +9,12 @@ from torch import Tensor
 from polarguide.capture import Scene
 from polarguide.raster import Backend, choose_backend
 from polarguide.runs.folder import resolve
-from polarguide.training.angles.fits import AngleFits, gaussian_training
+from polarguide.training.angles.polarizers import AngleFits, gaussian_training
 from polarguide.training.callback import Callback, Loop
-from polarguide.training.context import TrainingContext
+from polarguide.training.context import TrainingContext, TrainingState
 from polarguide.training.loop import TrainingLoop
 from polarguide.training.recipe import Recipe
 from polarguide.training.settings import StepReport, TrainSettings
-from polarguide.training.state import TrainingState
 from polarguide.training.storage import ViewStore
 
 CPU = choose_backend("cpu")

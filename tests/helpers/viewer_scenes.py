@@ -8,7 +8,7 @@ from polarguide.geometry.camera import Camera
 from polarguide.geometry.scene_frame import SceneFrame, scene_frame
 from polarguide.raster.cpu import rasterize_cpu
 from polarguide.viewer import Scenery
-from polarguide.viewer.cameras import Photograph
+from polarguide.viewer.scenery import Photograph
 
 
 def shown(recipe: str = "polarguide-stokes") -> Scenery:

@@ -12,7 +12,7 @@ from captures import write_scene
 from glossy_ball import camera_at
 
 from polarguide.geometry.camera import Camera
-from polarguide.inspection import inspect, view_checks
+from polarguide.inspection import inspect, picture_checks
 from polarguide.inspection.capture import Capture, read_capture
 from polarguide.inspection.inspect import PairError, _fundamental, _pair_error, epipolar_errors, view_errors
 
@@ -148,13 +148,13 @@ def turned_round(camera: Camera) -> Camera:
 
 def test_held_out_views_that_look_elsewhere_are_named(whole_demo) -> None:
     capture = read_capture(whole_demo)
-    usual = view_checks.held_out_check(capture)
+    usual = picture_checks.held_out_check(capture)
     name = capture.test_names[-1]
     turned = tuple(
         dataclasses.replace(view, camera=turned_round(view.camera)) if view.name == name else view
         for view in capture.views
     )
-    check = view_checks.held_out_check(dataclasses.replace(capture, views=turned))
+    check = picture_checks.held_out_check(dataclasses.replace(capture, views=turned))
     assert check.verdict == "warning"
     assert check.views[0] == name
     assert check.figures["unseen"][name] > 0.5 > usual.figures["unseen"][name]
@@ -162,12 +162,12 @@ def test_held_out_views_that_look_elsewhere_are_named(whole_demo) -> None:
 
 def test_held_out_views_between_training_views_are_fine(whole_demo) -> None:
     capture = read_capture(whole_demo)
-    middle = sorted(view_checks.held_out_check(capture).figures["unseen"].items(), key=lambda item: item[1])[
-        0
-    ][0]
-    check = view_checks.held_out_check(dataclasses.replace(capture, test_names=(middle,)))
+    middle = sorted(
+        picture_checks.held_out_check(capture).figures["unseen"].items(), key=lambda item: item[1]
+    )[0][0]
+    check = picture_checks.held_out_check(dataclasses.replace(capture, test_names=(middle,)))
     assert (check.verdict, check.views) == ("ok", ())
 
 
 def test_without_held_out_views_there_is_nothing_to_judge(posed) -> None:
-    assert view_checks.held_out_check(dataclasses.replace(posed, test_names=())).verdict == "n/a"
+    assert picture_checks.held_out_check(dataclasses.replace(posed, test_names=())).verdict == "n/a"

@@ -15,7 +15,7 @@ from glossy_ball import camera_at
 import polarguide
 from polarguide.capture.point_exposures import PointExposures
 from polarguide.inspection.capture import read_capture
-from polarguide.inspection.view_checks import lens_check, view_exposure_check
+from polarguide.inspection.picture_checks import lens_check, view_exposure_check
 
 
 def exposed(scene: Path, out: Path, stops: np.ndarray, channels: np.ndarray) -> dict[str, np.ndarray]:

@@ -18,12 +18,12 @@ from polarguide.capture.checks import measured_gains, pair_moments
 from polarguide.capture.develop import (
     BracketedShots,
     LinearShots,
-    MosaicFiles,
+    align_shots,
+    estimate_shifts,
     exposures_of_view,
     stated_exposures,
 )
 from polarguide.capture.filter.camera_files import exif_data
-from polarguide.capture.filter.develop import align_shots, estimate_shifts
 from polarguide.capture.filter.encoding import (
     LOSSY,
     PLAIN,
@@ -36,8 +36,8 @@ from polarguide.capture.filter.encoding import (
 from polarguide.capture.filter.shots import Shots, read_stack, stacked
 from polarguide.capture.formats.pictures import decode_mask, decode_picture
 from polarguide.capture.sensor.demosaic import defects
+from polarguide.capture.sensor.mosaics import PACKINGS, MosaicFiles, RawFormat, read_mosaic
 from polarguide.capture.sensor.pattern import estimate_levels, sensor_pattern, tiled
-from polarguide.capture.sensor.raw_file import PACKINGS, RawFormat, read_mosaic
 from polarguide.optics.color import srgb_encode_array as srgb_encode
 from polarguide.preparation.filter_source import SinglesSource
 from polarguide.preparation.prepare import prepare_scene
@@ -279,6 +279,17 @@ def test_hot_pixels_are_found_and_noise_is_not():
     assert defects(views, 2).sum() == 0
     found = defects([view + 800 * hot for view in views], 2)
     assert found[hot].mean() > 0.8  # one beside another may be missed
+    assert not found[~hot].any()
+
+
+@pytest.mark.filterwarnings("error")
+def test_hot_pixels_are_found_on_black():
+    rng = np.random.default_rng(3)
+    hot = rng.random((96, 128)) < 0.003
+    black = [64.0 + rng.integers(0, 3, hot.shape) for _ in range(3)]
+    assert defects(black, 2).sum() == 0
+    found = defects([view + 800 * hot for view in black], 2)
+    assert found[hot].mean() > 0.8
     assert not found[~hot].any()
 
 

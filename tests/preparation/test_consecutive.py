@@ -17,7 +17,7 @@ from PIL.TiffImagePlugin import IFDRational
 
 from polarguide.capture.colmap.sfm import run_step
 from polarguide.capture.filter.camera_files import Lens, camera_groups
-from polarguide.capture.filter.consecutive import (
+from polarguide.capture.filter.shots import (
     chosen_matching,
     shots_of_one_place,
 )

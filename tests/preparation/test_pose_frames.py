@@ -23,9 +23,9 @@ from heard import Heard
 from test_prepare_filter import with_orientation
 
 from polarguide.capture import load_scene
+from polarguide.capture.calibration import apply_orientation
 from polarguide.capture.colmap.model import PosedCamera
 from polarguide.capture.colmap.poses import Geometry, Poses
-from polarguide.capture.filter.camera_files import apply_orientation
 from polarguide.preparation.open_source import known_poses, settle_pose_frames
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import PrepareSettings

@@ -15,8 +15,9 @@ from camera_files import ANGLES, behind, busy_light, read_invalid, read_polar, s
 from faults import Fault
 from tiny_capture import encode_srgb, write_picture
 
-from polarguide.capture.filter.camera_files import apply_orientation, orientation
-from polarguide.capture.filter.develop import Shift, estimate_shifts, shift_notes
+from polarguide.capture.calibration import apply_orientation
+from polarguide.capture.develop import Shift, estimate_shifts, shift_notes
+from polarguide.capture.filter.camera_files import orientation
 from polarguide.capture.filter.shots import find_shots
 from polarguide.core.errors import PolarguideWarning
 from polarguide.preparation.prepare import prepare_scene

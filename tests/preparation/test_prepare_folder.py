@@ -23,8 +23,8 @@ from refused_preparations import MOSAIC, NAMES, refused
 from polarguide.capture.calibration import Calibration
 from polarguide.capture.datasets.readers import DATASETS
 from polarguide.capture.sensor.demosaic import DEMOSAIC_MODES
+from polarguide.capture.sensor.mosaics import PACKINGS
 from polarguide.capture.sensor.pattern import SENSORS
-from polarguide.capture.sensor.raw_file import PACKINGS
 from polarguide.core import files
 from polarguide.core.system import only_writer
 from polarguide.preparation import prepare as prepare_module

@@ -33,7 +33,7 @@ from relief import DEPTHS, write_relief
 from polarguide.capture import load_scene
 from polarguide.capture.colmap import sfm as points_module
 from polarguide.capture.colmap.model import PosedCamera, posed_model
-from polarguide.capture.colmap.sfm import match_features, sample_visual_hull, tone_mapped
+from polarguide.capture.colmap.sfm import colors_of_points, match_features, sample_visual_hull, tone_mapped
 from polarguide.capture.write import write_png_file
 from polarguide.core.progress import SILENT
 from polarguide.preparation.prepare import prepare_scene
@@ -436,6 +436,17 @@ def test_parallel_cameras_are_not_a_traceback() -> None:
     }
     places = sample_visual_hull(cameras, {}, 100, np.random.default_rng(0))
     assert len(places) == 0 or (places[:, 2] > 0).all()
+
+
+def test_colors_of_sampled_points_follow_the_distortion_of_the_lens(tmp_path: Path) -> None:
+    camera = PosedCamera(64, 48, "SIMPLE_RADIAL", (60.0, 32.0, 24.0, 0.5), np.eye(3), np.zeros(3))
+    columns = np.broadcast_to(3 * np.arange(64, dtype=np.uint8)[None, :, None], (48, 64, 3))
+    write_png_file(tmp_path / "images" / "a.png", columns)
+    x = 0.45
+    column = int(60.0 * x * (1 + 0.5 * x**2) + 32.0)
+    assert column != int(60.0 * x + 32.0)
+    found = colors_of_points(tmp_path, {"a": camera}, np.array([[x, 0.0, 1.0]]))
+    np.testing.assert_array_equal(found, [[3 * column] * 3])
 
 
 @pytest.mark.parametrize(

@@ -22,9 +22,9 @@ from heard import Heard
 from raw_photographs import write_dng
 from tiny_capture import encode_srgb, write_picture
 
-from polarguide.capture.calibration import Calibration
+from polarguide.capture.calibration import TURNS, Calibration, apply_orientation
 from polarguide.capture.colmap.model import read_model
-from polarguide.capture.filter.camera_files import TURNS, Lens, apply_orientation
+from polarguide.capture.filter.camera_files import Lens
 from polarguide.geometry.polarizer import malus
 from polarguide.preparation import prepare as prepare_module
 from polarguide.preparation.filter_source import SinglesSource

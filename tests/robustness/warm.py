@@ -46,7 +46,7 @@ def import_all() -> None:
     for verb in app.VERBS:
         with contextlib.redirect_stdout(io.StringIO()), contextlib.suppress(SystemExit):
             app.run([verb, "--help"])
-    importlib.import_module("polarguide.results.evaluation.record").code_digest()
+    importlib.import_module("polarguide.results.evaluation.evaluate").code_digest()
     tasks = Path("/proc/self/task")
     threads = [(task / "comm").read_text().strip() for task in tasks.iterdir()] if tasks.exists() else []
     assert len(threads) <= 1, (

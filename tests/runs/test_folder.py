@@ -32,9 +32,9 @@ from polarguide.runs.folder import (
     save_checkpoint,
     writing_to,
 )
+from polarguide.training.context import TrainingState
 from polarguide.training.recipe import Recipe
 from polarguide.training.settings import ResolvedSettings, TrainSettings
-from polarguide.training.state import TrainingState
 
 
 @pytest.fixture

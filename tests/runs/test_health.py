@@ -37,8 +37,8 @@ from polarguide.runs.model import GaussianModel
 from polarguide.runs.train import train_gaussians
 from polarguide.shading.result import RenderResult
 from polarguide.training.angles.polarizers import Polarizers
+from polarguide.training.context import TrainingState
 from polarguide.training.settings import TrainSettings
-from polarguide.training.state import TrainingState
 from polarguide_bench.report import recorded_health
 
 STOKES = RECIPES["polarguide-stokes"]

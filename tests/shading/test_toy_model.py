@@ -27,12 +27,12 @@ from polarguide.runs.folder import load_checkpoint, save_checkpoint
 from polarguide.runs.model import write_run_ply
 from polarguide.shading.gbuffer import RenderRequest, render
 from polarguide.shading.result import LAYERS, RenderResult
-from polarguide.training.angles.fits import gaussian_training
+from polarguide.training.angles.polarizers import gaussian_training
 from polarguide.training.callbacks import reset_opacity
+from polarguide.training.context import TrainingState, first_state
 from polarguide.training.loop import TrainingLoop
 from polarguide.training.recipe import Recipe
 from polarguide.training.settings import TrainSettings
-from polarguide.training.state import TrainingState, first_state
 from polarguide.viewer import training_scenery
 from polarguide.viewer.scenery import Appearance, Painter
 from polarguide_bench.recipes import ablations_of

@@ -12,11 +12,11 @@ from faults import Fault
 
 import polarguide
 from polarguide import optics
-from polarguide.geometry.vectors import unit
-from polarguide.results.rendering.pictures import resolving_normals
+from polarguide.geometry.camera import unit
 from polarguide_shots.exposures import find_shots
 from polarguide_shots.maps import Developed, NoiseModel, ShotMaps
 from polarguide_shots.options import ShotOptions
+from polarguide_shots.prior_pictures import resolving_normals
 from polarguide_shots.read import TOWARD, camera_of, maps_of, parse_intrinsics, read_shot, surface_maps
 from polarguide_shots.sets import ExposureSet
 

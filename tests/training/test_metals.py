@@ -24,7 +24,7 @@ from polarguide.raster.cpu import rasterize_cpu
 from polarguide.runs.folder import load_checkpoint, save_checkpoint
 from polarguide.runs.health import METALS_PICTURE, report_metals
 from polarguide.runs.model import GaussianModel
-from polarguide.training.angles.fits import gaussian_training
+from polarguide.training.angles.polarizers import gaussian_training
 from polarguide.training.loop import TrainingLoop
 from polarguide.training.metals.observations import ViewSamples, contradicted, label_weights, shares
 from polarguide.training.metals.search import (

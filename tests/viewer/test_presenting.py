@@ -18,9 +18,8 @@ from polarguide.capture.presentation import (
     write_presentation,
 )
 from polarguide.shading.result import LAYERS
-from polarguide.viewer.panel import PanelOptions
 from polarguide.viewer.server import save_to_run
-from polarguide.viewer.session import Session
+from polarguide.viewer.session import PanelOptions, Session
 
 AROUND = frame_of_scene()
 WHITE = Presentation(white_balance=(0.5, 1.0, 1.5))

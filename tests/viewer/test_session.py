@@ -9,9 +9,9 @@ from fake_browser import FakeClient
 from viewer_scenes import frame_of_scene, photographs, shown
 
 from polarguide.shading.result import LAYERS
-from polarguide.viewer.panel import FREE_VIEW, PanelOptions
 from polarguide.viewer.session import (
     BUDGET,
+    FREE_VIEW,
     GREATEST_HEIGHT,
     LEAST_HEIGHT,
     NO_LAYER,
@@ -19,6 +19,7 @@ from polarguide.viewer.session import (
     PICTURE_FILE,
     REST,
     FramePacing,
+    PanelOptions,
     Session,
 )
 from polarguide.visualization import figures

@@ -102,7 +102,7 @@ def psnr(picture: np.ndarray, expected: np.ndarray) -> float:
 def opened() -> Iterator[Opened]:
     with chromium() as browser, pytest.MonkeyPatch.context() as patch:
         patch.setattr(
-            "polarguide.viewer.cameras.ARRIVAL", PATIENCE
+            "polarguide.viewer.scenery.ARRIVAL", PATIENCE
         )  # a busy machine's browser takes its time
         viewing = Opened(browser)
         yield viewing

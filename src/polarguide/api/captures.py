@@ -6,8 +6,7 @@ from pathlib import Path
 
 from polarguide.core.options import DeviceName, PathLike
 from polarguide.core.progress import SILENT, Reporter
-from polarguide.inspection.inspect import Inspection, inspect_scene, inspection_folder
-from polarguide.inspection.report import write_inspection
+from polarguide.inspection.inspect import Inspection, inspect_scene, inspection_folder, write_inspection
 from polarguide.inspection.settings import InspectSettings
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.raster import choose_backend

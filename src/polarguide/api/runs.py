@@ -17,10 +17,10 @@ from polarguide.core.files import require_folder
 from polarguide.core.options import PathLike, SceneOptions, SessionOptions, VisitorOptions
 from polarguide.core.progress import SILENT, Reporter
 from polarguide.results.evaluation import evaluate
-from polarguide.results.evaluation.record import read_metrics
+from polarguide.results.evaluation.evaluate import read_metrics
 from polarguide.results.evaluation.table import shown_metrics
 from polarguide.results.export import formats, web_page
-from polarguide.results.rendering import film, pictures, relight
+from polarguide.results.rendering import pictures, relight
 from polarguide.runs import train as training
 from polarguide.runs.opened import OpenedRun
 from polarguide.training.callback import AnyCallback
@@ -49,7 +49,7 @@ class Run(OpenedRun):
     relight = relight.relight
     share = web_page.share
     view = server.view_run
-    write_film = film.write_film
+    write_film = pictures.write_film
     write_pictures = pictures.write_pictures
 
     def metrics(self) -> Mapping[str, Any]:

@@ -20,8 +20,8 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from polarguide.capture.exposure_files import exposure_files, exposure_name
 from polarguide.capture.filter.camera_files import missing_tags, read_exposure_data
+from polarguide.capture.layout import exposure_files, exposure_name
 from polarguide.core.errors import PolarguideError, require
 
 READ_NOISE = 2.4**2 / 10500

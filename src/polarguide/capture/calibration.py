@@ -1,4 +1,7 @@
-"""Calibration of a polarization camera or filter: gains of the four pictures, and their true polarizer angles."""
+"""Calibration of a polarization camera or filter, and rotation of its pictures for display.
+
+A calibration contains the gains of the four pictures, and their true polarizer angles.
+"""
 
 from __future__ import annotations
 
@@ -225,3 +228,51 @@ def oriented(intensities: NDArray[np.float32], calibration: Calibration) -> NDAr
     return np.maximum(
         np.stack(four_intensities((s0, s1 * cosine - s2 * sine, s1 * sine + s2 * cosine))), 0.0
     ).astype(np.float32)
+
+
+_MIRRORED = (2, 4, 5, 7)
+QUARTER_TURNS = (5, 6, 7, 8)
+"""EXIF orientations that exchange width and height."""
+INVERSE = {code: {6: 8, 8: 6}.get(code, code) for code in range(1, 9)}
+"""EXIF orientation that undoes each orientation."""
+TURNS = {
+    2: "mirrored left to right",
+    3: "turned by 180 degrees",
+    4: "mirrored top to bottom",
+    5: "mirrored along the falling diagonal",
+    6: "turned by 90 degrees clockwise",
+    7: "mirrored along the rising diagonal",
+    8: "turned by 90 degrees counter-clockwise",
+}
+"""Description of the change from the stored to the displayed picture, for each EXIF orientation except 1."""
+
+
+def apply_orientation(pixels: NDArray[Any], code: int) -> NDArray[Any]:
+    """Rotate or mirror pixels [H, W, ...] for display according to an EXIF orientation."""
+    if code in (5, 7):
+        pixels = pixels.swapaxes(0, 1)
+        return np.rot90(pixels, 2) if code == 7 else pixels
+    if code in (2, 4):
+        return np.flip(pixels, axis=1 if code == 2 else 0)
+    return np.rot90(pixels, {1: 0, 3: 2, 6: -1, 8: 1}[code])
+
+
+def orientation_calibration(code: int) -> Calibration:
+    """Return the sense and zero of polarizer angles that result from rotating or mirroring a picture for display."""
+    return Calibration(
+        sense="cw" if code in _MIRRORED else "ccw", zero=90.0 if code in QUARTER_TURNS else 0.0
+    )
+
+
+def as_displayed(
+    linear: NDArray[np.float32], calibration: Calibration, orientation: int
+) -> NDArray[np.float32]:
+    """Convert four shots to displayed angles of 0, 45, 90 and 135 degrees, and rotate them for display.
+
+    Args:
+        linear: linear intensities of the shots, [4, H, W, C].
+        calibration: order, sense and zero of the angles.
+        orientation: EXIF orientation of the shots.
+    """
+    turned = np.stack([apply_orientation(picture, orientation) for picture in oriented(linear, calibration)])
+    return oriented(turned, orientation_calibration(orientation))

@@ -1,4 +1,4 @@
-"""Compute linear intensities from camera files: mosaics of a polarization sensor, and shots through a filter.
+"""Compute linear intensities from shots through a filter, and estimate levels, exposures and gains of camera files.
 
 The functions work for whole captures and for single shots. Levels and exposures are estimated from all pictures that
 the caller passes together.
@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from functools import lru_cache
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,330 +21,264 @@ from polarguide.capture.brackets import (
     SINGLE,
     Bracket,
     MergedExposures,
-    Radiance,
     measure_exposures,
     merge,
 )
 from polarguide.capture.calibration import (
     UNIT_GAINS,
-    Calibration,
     Gains,
     balancing_gains,
-    oriented,
-    pair_ratio,
 )
 from polarguide.capture.checks import measured_gains, pair_moments
 from polarguide.capture.filter.camera_files import (
     ExposureData,
-    apply_orientation,
     is_camera_raw,
     missing_tags,
-    orientation_calibration,
     read_exposure_data,
 )
-from polarguide.capture.filter.develop import Shift, align_shots, estimate_shifts
 from polarguide.capture.filter.shots import Shots, read_stack
-from polarguide.capture.formats.pictures import linear_codes, may_use_fewer_bits
-from polarguide.capture.layout import require_memory, require_memory_of_each
-from polarguide.capture.raw_options import GainOptions, RawMosaicOptions, SampledOptions
+from polarguide.capture.formats.pictures import linear_codes
+from polarguide.capture.formats.stored import may_use_fewer_bits, require_alike
+from polarguide.capture.raw_options import GainOptions, SampledOptions
 from polarguide.capture.sensor.analyzers import (
-    AnalyzerCalibration,
     imbalance_notes,
-    read_analyzers,
-    spread_to_cells,
 )
 from polarguide.capture.sensor.pattern import (
     FULL_16,
-    SENSOR_NAMES,
-    SENSOR_SIZES,
     Levels,
     estimate_levels,
     level_notes,
-    sensor_pattern,
-    tiled,
-    unusable_samples,
 )
-from polarguide.capture.sensor.raw_file import RawFormat, read_mosaic, require_mosaic
 from polarguide.capture.view import FULL_CODE
-from polarguide.capture.view_reader import require_alike
-from polarguide.core.errors import PolarguideError, require
-from polarguide.core.files import require_file
+from polarguide.core.errors import PolarguideError
 from polarguide.core.progress import Advance
 from polarguide.geometry.polarizer import ANGLES
 
-QUARTER_FLIPS = ("90", "270")
-"""Values of the option ``flip`` that specify a rotation by 90 degrees or 270 degrees counter-clockwise."""
-SMALLEST = 16
-"""Smallest length of the shorter side of a mosaic in pixels."""
-WORKED = {"quarter": 16, "half": 60, "full": 240}
-"""Number of bytes per sensor pixel that the development of a mosaic takes at least, by demosaicing mode."""
+SMALLEST = 0.2
+"""Smallest shift in pixels that is corrected. The estimate has errors of this size, and a correction blurs a shot."""
+LARGEST_SHARE = 0.05
+"""Largest shift that is corrected, as a share of the picture's width."""
+
+_BETTER = 0.95
+_CRITERIA = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 100, 1e-5)
 
 
-class MosaicFiles:
-    """Reader of the raw mosaics of one sensor, which also converts their values to linear intensities.
+@dataclass(frozen=True)
+class Shift:
+    """Displacement of a shot relative to the first.
 
     Attributes:
-        pattern: pattern of the sensor, starting at the top-left pixel of a mosaic after ``cut``.
-        crop: number of columns and rows that ``cut`` removes at the left and top.
-        corner: column and row of the sensor at which a mosaic starts after ``cut``.
-        analyzers: calibration of the sensor, or None.
+        x: shift to the right in pixels. If there is a ``warp``, it is the shift of the picture's center.
+        y: shift down in pixels, as ``x``.
+        trusted: True if the estimate is reliable.
+        warp: affine matrix [2, 3] from pixels of the first shot to pixels of this shot, row by row. It is ``None`` if
+            the shot is not rotated. The center of the first pixel is at (0, 0).
     """
 
-    def __init__(self, options: RawMosaicOptions) -> None:
-        """Create a reader with the sensor, region, packing, dark frame and calibration of the options.
+    x: float
+    y: float
+    trusted: bool
+    warp: tuple[float, ...] | None = None
 
-        Raises:
-            PolarguideError: the sensor is missing, or the calibration is damaged or belongs to another sensor.
-        """
-        if options.sensor is None:
-            raise PolarguideError(
-                "--sensor",
-                expected=f"the sensor of raw mosaics: {SENSOR_NAMES}",
-                found="none",
-                remedy="Name the sensor: color and monochrome sensors have different patterns.",
-            )
-        self._options = options
-        self._sensor = options.sensor
-        self._raw = RawFormat(options.width, options.height, options.packing)
-        pattern = sensor_pattern(options.sensor).shifted(options.offset_x, options.offset_y)
-        self.crop = pattern.cell_corner()
-        self.pattern = pattern.shifted(*self.crop)
-        self.corner = (options.offset_x + self.crop[0], options.offset_y + self.crop[1])
-        self.analyzers = calibration_of(options)
+    @property
+    def corrected(self) -> bool:
+        """True if the shift is reliable and large enough for a correction."""
+        return self.trusted and (self.warp is not None or max(abs(self.x), abs(self.y)) >= SMALLEST)
 
-    def read(self, where: Path | str, values: NDArray[Any] | None = None) -> NDArray[Any]:
-        """Read the stored values [H, W] of a whole mosaic, and return them in the orientation of the sensor.
 
-        Args:
-            where: path of the file, or a name for messages if the mosaic is in memory.
-            values: mosaic in memory, uint8 or uint16. By default, the file ``where`` is read.
+AGREEING = 0.05
+"""Largest mean of |I0 + I90 - I45 - I135| / S0 at which four shots count as aligned."""
 
-        Raises:
-            PolarguideError: the file is unreadable, too small, or a grid of four pictures. Or the mosaic does not fit
-                into memory, or is larger than the calibrated region.
-        """
-        if values is None:
-            self._require_memory(Path(where))
-            values = read_mosaic(Path(where), self._raw, least=SMALLEST)
+
+def estimate_shifts(linear: NDArray[np.float32]) -> list[Shift]:
+    """Estimate the shifts of the four shots relative to the first.
+
+    Phase correlation of fine detail in the logarithms gives initial values: brightness and polarization vary slowly
+    across a surface, and edges stay. Maximization of the enhanced correlation coefficient refines them to a fraction of
+    a pixel. Edges of polarization can mislead both. Shifts are therefore trusted only if they improve I0 + I90 = I45 +
+    I135. A rotation is added if it improves the pair sums further. A homography would improve them more, but deviates
+    more from the truth.
+
+    Args:
+        linear: linear intensities [4, H, W, 3].
+    """
+    detail = [_detail(shot) for shot in linear]
+    shifts = [Shift(0.0, 0.0, True), *(_shift(detail[0], other) for other in detail[1:])]
+    least = _disagreement(linear, np.zeros(linear.shape[1:3], bool))
+    if any(shift.corrected for shift in shifts):
+        after = _aligned_disagreement(linear, shifts)
+        if after < _BETTER * least:
+            least = after
         else:
-            require_mosaic(where, values, least=SMALLEST)
-        values = self._turned_back(where, values)
-        if self.analyzers is not None:
-            self.analyzers.require_region(
-                (self._options.offset_x, self._options.offset_y), values.shape[::-1], self._options.analyzers
-            )
-        return values
-
-    def _require_memory(self, path: Path) -> None:
-        worked = WORKED[self._options.demosaic]
-        raw = self._raw
-        remedy = "Specify a region of the sensor, or choose --demosaic half or quarter."
-        if path.suffix.lower() != ".raw":
-            require_memory_of_each([path], worked, "a mosaic", remedy=remedy)
-        elif raw.width is not None and raw.height is not None:
-            require_memory(
-                path, worked * raw.width * raw.height, f"a mosaic of {raw.width}x{raw.height}", remedy=remedy
-            )
-
-    def _turned_back(self, where: Path | str, values: NDArray[Any]) -> NDArray[Any]:
-        """Undo the mirroring or rotation of a mosaic that the option ``flip`` specifies.
-
-        Raises:
-            PolarguideError: the mosaic is wider or higher than the sensor, possibly because it was rotated.
-        """
-        flip = self._options.flip
-        if flip in QUARTER_FLIPS:
-            values = np.rot90(values, -1 if flip == "90" else 1)
-        width, height = SENSOR_SIZES[self._sensor]
-        left = self._options.offset_x
-        top = self._options.offset_y
-        rows, columns = values.shape
-        if columns > width - left or rows > height - top:
-            rotated = rows <= width and columns <= height and flip not in QUARTER_FLIPS
-            raise PolarguideError(
-                where,
-                expected=f"a mosaic in the orientation of the sensor, at most {width - left}x{height - top} pixels of "
-                f"{self._sensor}",
-                found=f"{columns}x{rows}" + (", probably rotated by 90 degrees" if rotated else ""),
-                remedy="Use --flip 90 if the mosaic was rotated counter-clockwise, --flip 270 if clockwise."
-                if rotated
-                else "Check --sensor, --offset-x and --offset-y.",
-            )
-        values = values[:, ::-1] if flip in ("x", "xy") else values
-        return values[::-1] if flip in ("y", "xy") else values
-
-    def depth(self, path: Path, values: NDArray[Any]) -> tuple[int, int | None]:
-        """Return the number of bits per pixel in a file, and the full scale that the file states.
-
-        The full scale is ``None`` if the file does not state it, or if the user specifies ``bits``.
-        """
-        stated = self._raw.full_scale(path, values) if self._options.bits is None else None
-        return self._raw.container(path, values.dtype), stated
-
-    def cut(self, values: NDArray[Any]) -> NDArray[Any]:
-        """Crop a mosaic [H, W] so that it consists of whole polarizer cells."""
-        values = values[self.crop[1] :, self.crop[0] :]
-        return np.ascontiguousarray(values[: values.shape[0] // 2 * 2, : values.shape[1] // 2 * 2])
-
-    def dark(self, shape: tuple[int, ...]) -> NDArray[np.float32] | None:
-        """Return the dark frame, cropped by ``cut``. Return None if the user specifies no dark frame."""
-        if self._options.dark_frame is None:
-            return None
-        dark = self._turned_back(self._options.dark_frame, read_mosaic(self._options.dark_frame, self._raw))
-        require(
-            dark.shape == shape,
-            self._options.dark_frame,
-            expected=f"a dark frame of {shape[1]}x{shape[0]} pixels like the mosaics",
-            found=f"{dark.shape[1]}x{dark.shape[0]}",
-            remedy="Photograph it with the same region and settings, and with the lens covered.",
-        )
-        return self.cut(dark).astype(np.float32)
-
-    def ratio_of_blocks(
-        self,
-        samples: list[NDArray[Any]],
-        levels: Levels,
-        dark: NDArray[np.float32] | None,
-        shape: tuple[int, ...],
-    ) -> float | None:
-        """Measure the ratio of the pair sums in blocks of mosaics.
-
-        Samples of different angles are at different pixels. Tent weights interpolate all of them to the center of
-        a block of two periods, so gradients of the picture cancel in the ratio.
-
-        Args:
-            samples: blocks with a side of two periods from each mosaic, see ``sample_blocks``.
-            levels: levels of the stored values.
-            dark: dark frame, or None.
-            shape: numbers of rows and columns of a mosaic after ``cut``.
-
-        Returns:
-            The ratio (I0 + I90) / (I45 + I135), or None if the blocks are too dark.
-        """
-        values = np.concatenate(samples)
-        period = self.pattern.period
-        floor = None if dark is None else np.tile(sample_blocks(dark, 2 * period), (len(samples), 1, 1))
-        linear = levels.linear(values, floor).astype(np.float64)
-        if self.analyzers is not None:
-            of_cells = self.analyzers.correction(self.corner, (shape[1], shape[0]))
-            cells = linear.reshape(len(samples), -1, period, 2, period, 2)
-            planes = [cells[..., row, :, column].copy() for row, column in np.ndindex(2, 2)]
-            for matrices, (row, column) in zip(of_cells, np.ndindex(2, 2), strict=True):
-                parts = [sample_blocks(m, period) * plane for m, plane in zip(matrices, planes, strict=True)]
-                cells[..., row, :, column] = sum(parts)
-        rising = (np.arange(period) + 0.5) / period
-        tent = np.concatenate([rising, rising[::-1]])
-        weighted = linear * tent[:, None] * tent
-        places = np.tile(self.pattern.angles, (2, 2))
-        # The weights of each angle sum to the number of its samples in a period.
-        angles = np.stack([weighted[:, places == angle].sum(axis=1) for angle in ANGLES])
-        angles *= 4 / period**2
-        base = levels.black if floor is None else floor
-        usable = np.asarray((values < levels.saturation).all(axis=(1, 2)) & (values > base).any(axis=(1, 2)))
-        return pair_ratio(angles, usable)
-
-    def merged(
-        self,
-        bracket: Bracket,
-        exposures: Sequence[NDArray[Any]],
-        levels: Levels,
-        dark: NDArray[np.float32] | None,
-        part: tuple[slice, slice] | None = None,
-    ) -> tuple[Radiance, NDArray[np.bool_]]:
-        """Convert the stored values of a mosaic to linear intensities, and merge its exposures.
-
-        Args:
-            bracket: files of the exposures.
-            exposures: stored values of each exposure after ``cut``, [H, W].
-            levels: levels of the stored values.
-            dark: dark frame [H, W], or None.
-            part: rows and columns of the result; default: all. The exposures are measured in the whole mosaic.
-
-        Returns:
-            The linear intensities [H, W]; and the mask of samples that are dark in all exposures.
-
-        Raises:
-            PolarguideError: the exposures contradict each other, see ``measure_exposures``.
-        """
-
-        def linear(
-            data: tuple[NDArray[Any], NDArray[np.float32] | None],
-        ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-            return levels.linear(*data), np.asarray(data[0] >= levels.saturation)
-
-        measured = measure_exposures(bracket, [(values, dark) for values in exposures], linear)
-        if part is not None:
-            exposures = [np.ascontiguousarray(values[part]) for values in exposures]
-            dark = None if dark is None else dark[part]
-        radiance = merge([(values, dark) for values in exposures], linear, measured)
-        black = [unusable_samples(values, levels, dark)[1] for values in exposures]
-        return radiance, np.logical_and.reduce(black)
-
-    def calibrated(
-        self,
-        linear: NDArray[np.float32],
-        *masks: NDArray[np.bool_],
-        corner: tuple[int, int] | None = None,
-    ) -> tuple[NDArray[np.float32], tuple[NDArray[np.bool_], ...]]:
-        """Apply the calibration to the linear intensities of a mosaic or a part of it.
-
-        The calibration mixes the samples of a polarizer cell. If there is a calibration, masks of unusable samples are
-        therefore extended to whole cells.
-
-        Args:
-            linear: linear intensities [H, W].
-            masks: masks of unusable samples, [H, W] each.
-            corner: column and row of the sensor at which the part starts; default: ``corner`` of the reader.
-
-        Returns:
-            The linear intensities [H, W], and the masks.
-        """
-        if self.analyzers is None:
-            return linear, masks
-        return self.analyzers.apply(linear, offset=corner or self.corner), tuple(map(spread_to_cells, masks))
-
-    def sample_factors(
-        self, shape: tuple[int, ...], gains: Sequence[float], scale: float = 1.0
-    ) -> NDArray[np.float32]:
-        """Return the factor by which each sample of a mosaic is multiplied, ``scale / gain`` of its angle, [H, W]."""
-        of_angle = dict(zip(ANGLES, gains, strict=True))
-        factors = np.vectorize(lambda angle: scale / of_angle[angle])(self.pattern.angles)
-        return tiled(factors.astype(np.float32), shape)
+            shifts = [shifts[0], *(replace(shift, trusted=False) for shift in shifts[1:])]
+    turned = [shifts[0], *(_turn(detail[0], detail[k], shifts[k]) for k in (1, 2, 3))]
+    if turned != shifts and _aligned_disagreement(linear, turned) < _BETTER * least:
+        return turned
+    if least < AGREEING:  # pair sums agree, so shots did not move
+        return [shift if shift.trusted else Shift(0.0, 0.0, True) for shift in shifts]
+    return shifts
 
 
-def calibration_of(options: RawMosaicOptions) -> AnalyzerCalibration | None:
-    """Read the calibration of the sensor. Return None if the options specify no calibration.
+def _aligned_disagreement(linear: NDArray[np.float32], shifts: Sequence[Shift]) -> float:
+    moved, _, outside = align_shots(linear, (), shifts)
+    return _disagreement(moved, outside)
 
-    The calibration is cached because many mosaics use it.
 
-    Raises:
-        PolarguideError: the file is missing, damaged or belongs to another sensor.
+def _disagreement(linear: NDArray[np.float32], bad: NDArray[np.bool_]) -> float:
+    """Return the mean of |I0 + I90 - I45 - I135| / S0, after the two pair sums were scaled to the same brightness."""
+    i0, i45, i90, i135 = linear.mean(axis=3)[:, ~bad]
+    first = i0 + i90
+    second = i45 + i135
+    if not second.sum() > 0:
+        return 0.0
+    return float(np.abs(first - second * (first.sum() / second.sum())).sum() / first.sum())
+
+
+def align_shots(
+    linear: NDArray[np.float32], masks: Sequence[NDArray[np.bool_]], shifts: Sequence[Shift]
+) -> tuple[NDArray[np.float32], list[NDArray[np.bool_]], NDArray[np.bool_]]:
+    """Resample shots so that all of them are aligned with the first shot.
+
+    Args:
+        linear: linear intensities [K, H, W, 3].
+        masks: masks for each shot, [K, H, W], or for all shots, [H, W].
+        shifts: shift of each shot.
+
+    Returns:
+        The aligned intensities; for each of ``masks`` a mask [H, W] of the pixels that depend on a marked pixel of some
+        shot; and a mask [H, W] of the pixels that depend on a place outside a shot.
     """
-    path = options.analyzers
-    if path is None:
-        return None
-    require_file(path, expected="a file of polarguide calibrate", remedy="Check --calibration.")
-    state = path.stat()
-    calibration = _read_analyzers(path, state.st_mtime_ns, state.st_size)
-    calibration.require_sensor(options.sensor, path)
-    return calibration
+    height, width = linear.shape[1:3]
+    moved = linear.copy()
+    each = [np.broadcast_to(mask, linear.shape[:3]).copy() for mask in masks]
+    outside = np.zeros((height, width), bool)
+    for index, shift in enumerate(shifts):
+        if not shift.corrected:
+            continue
+        y, x = np.mgrid[:height, :width].astype(np.float32)
+        if shift.warp is None:
+            x = x + np.float32(shift.x)
+            y = y + np.float32(shift.y)
+        else:
+            places = np.stack([x.ravel(), y.ravel()], axis=-1)[:, None]
+            matrix = np.array(shift.warp, np.float64).reshape(2, 3)
+            x, y = cv2.transform(places, matrix)[:, 0].T.reshape(2, height, width)
+        moved[index] = cv2.remap(linear[index], x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        beyond = remapped_mask(np.zeros((height, width), bool), x, y)
+        for mask in each:
+            mask[index] = remapped_mask(mask[index], x, y) & ~beyond
+        outside |= beyond
+    return moved, [np.asarray(mask.any(axis=0)) for mask in each], outside
 
 
-@lru_cache(maxsize=1)
-def _read_analyzers(path: Path, *_: int) -> AnalyzerCalibration:
-    return read_analyzers(path)
+def remapped_mask(mask: NDArray[np.bool_], x: Any, y: Any) -> NDArray[np.bool_]:
+    """Resample a mask [H, W] at the coordinates ``x`` and ``y`` by bilinear interpolation.
+
+    A pixel of the result is True if its interpolation uses a marked pixel or a place outside the mask.
+    """
+    weight = cv2.remap(
+        mask.astype(np.float32), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=1.0
+    )
+    return np.asarray(weight > 0)
 
 
-_BLOCKS = 1024
+def moved_shots(shifts: Sequence[Shift]) -> list[str]:
+    """Describe each shot whose shift was corrected, as text."""
+    return [
+        f"{angle} by ({-shift.x:+.2f}, {-shift.y:+.2f}){'' if shift.warp is None else ' and turned'}"
+        for angle, shift in zip(ANGLES, shifts, strict=True)
+        if shift.corrected
+    ]
 
 
-def sample_blocks(values: NDArray[Any], size: int) -> NDArray[Any]:
-    """Return N square blocks of a mosaic in a regular grid, [N, size, size]."""
-    rows = values.shape[0] // size
-    columns = values.shape[1] // size
-    grid = values[: rows * size, : columns * size].reshape(rows, size, columns, size)
-    row, column = np.divmod(np.arange(0, rows * columns, max(1, rows * columns // _BLOCKS)), max(columns, 1))
-    return grid.swapaxes(1, 2)[row, column]
+def shift_notes(view: str, shifts: Sequence[Shift]) -> list[str]:
+    """Return notes for the user about shots with a corrected shift, and about shots with an unreliable shift."""
+    moved = moved_shots(shifts)
+    doubtful = [str(angle) for angle, shift in zip(ANGLES, shifts, strict=True) if not shift.trusted]
+    notes = [f"{view}: shots were shifted back, in pixels: {', '.join(moved)}."] if moved else []
+    if doubtful:
+        notes.append(
+            f"{view}: I0 + I90 and I45 + I135 differ, and no shift of the shots at {', '.join(doubtful)} explains it. "
+            "These shots are not shifted."
+        )
+    return notes
+
+
+def _detail(shot: NDArray[np.float32]) -> NDArray[np.float32]:
+    gray = np.log(shot.mean(axis=2) + np.float32(0.01))
+    return np.asarray(cv2.GaussianBlur(gray, (0, 0), 0.8) - cv2.GaussianBlur(gray, (0, 0), 5.0), np.float32)
+
+
+def _shift(reference: NDArray[np.float32], other: NDArray[np.float32]) -> Shift:
+    height, width = reference.shape
+    if min(height, width) < 2:  # the window needs two pixels
+        return Shift(0.0, 0.0, False)
+    window = cv2.createHanningWindow((width, height), cv2.CV_32F)
+    # The window reduces the weight of borders, where new content has no match. phaseCorrelate would apply it in place,
+    # and only for some sizes.
+    reference = reference * window
+    other = other * window
+    (x, y), _ = cv2.phaseCorrelate(reference, other)
+    limit = LARGEST_SHARE * width
+    if max(abs(x), abs(y)) > limit:
+        x = y = 0.0
+    warp = np.array([[1, 0, x], [0, 1, y]], np.float32)
+    try:
+        score, moved = cv2.findTransformECC(
+            reference, other, warp, cv2.MOTION_TRANSLATION, _CRITERIA, np.ones(reference.shape, np.uint8), 5
+        )
+    except cv2.error:  # no convergence without detail
+        return Shift(0.0, 0.0, False)
+    x, y = (float(value) for value in np.asarray(moved)[:, 2])
+    return Shift(
+        round(x, 3),
+        round(y, 3),
+        score > 0.3 and max(abs(x), abs(y)) <= limit and bool(np.isfinite([x, y]).all()),
+    )
+
+
+_TURN_SIDE = 1024
+"""Longer side in pixels at which rotations are estimated."""
+
+
+def _turn(reference: NDArray[np.float32], other: NDArray[np.float32], shift: Shift) -> Shift:
+    """Estimate the rotation of a shot in addition to its shift.
+
+    The shift is returned unchanged if the estimate does not converge, or if the rotation is negligible.
+    """
+    height, width = reference.shape
+    if min(height, width) < 2:
+        return shift
+    factor = max(1, -(-max(height, width) // _TURN_SIDE))
+    small = [
+        cv2.resize(d, (width // factor, height // factor), interpolation=cv2.INTER_AREA)
+        for d in (reference, other)
+    ]
+    half = (
+        factor - 1
+    ) / 2  # distance between the centers of the first pixels of the small and the large picture
+    large = np.array([[factor, 0, half], [0, factor, half], [0, 0, 1]], np.float64)
+    start = np.eye(3)
+    start[:2, 2] = (shift.x, shift.y) if shift.trusted else (0.0, 0.0)
+    start = (np.linalg.inv(large) @ start @ large).astype(np.float32)
+    everywhere = np.ones(small[0].shape, np.uint8)
+    try:
+        score, start[:2] = cv2.findTransformECC(
+            small[0], small[1], start[:2].copy(), cv2.MOTION_EUCLIDEAN, _CRITERIA, everywhere, 5
+        )
+    except cv2.error:  # no convergence without detail
+        return shift
+    warp = large @ start.astype(np.float64) @ np.linalg.inv(large)
+    corners = np.array([[x, y] for x in (0, width - 1) for y in (0, height - 1)], np.float64)
+    moved = cv2.transform(corners[:, None], warp[:2])[:, 0] - corners
+    middle = moved.mean(axis=0)
+    limit = LARGEST_SHARE * width
+    if not (np.isfinite(moved).all() and score > 0.3 and np.abs(moved).max() <= limit):
+        return shift
+    if np.abs(moved - middle).max() < SMALLEST:
+        return shift
+    x, y = (round(float(value), 3) for value in middle)
+    return Shift(x, y, True, tuple(float(f"{value:.9g}") for value in warp[:2].ravel()))
 
 
 LARGE_IMBALANCE = 0.01
@@ -380,20 +314,6 @@ def pair_gains(
         outcome = "left" if abs(deviation) > LARGE_IMBALANCE else ""
     used = gains if gains is not None and outcome == "corrected" else UNIT_GAINS
     return used, [notes[outcome].format(deviation)] if outcome in notes else []
-
-
-def as_displayed(
-    linear: NDArray[np.float32], calibration: Calibration, orientation: int
-) -> NDArray[np.float32]:
-    """Convert four shots to displayed angles of 0, 45, 90 and 135 degrees, and rotate them for display.
-
-    Args:
-        linear: linear intensities of the shots, [4, H, W, C].
-        calibration: order, sense and zero of the angles.
-        orientation: EXIF orientation of the shots.
-    """
-    turned = np.stack([apply_orientation(picture, orientation) for picture in oriented(linear, calibration)])
-    return oriented(turned, orientation_calibration(orientation))
 
 
 # Largest difference of the logarithms of two equal exposures. Files state exposures with three digits.
@@ -559,48 +479,6 @@ def levels_of_capture(
         bits=options.bits, black=black, saturation=options.saturation, counts=counts, stated=stated,
     )  # fmt: skip
     return levels, level_notes(levels, counts, container, options.bits, stated)
-
-
-def levels_of_shot(
-    values: NDArray[Any],
-    container: int,
-    options: SampledOptions,
-    *,
-    bits: int | None,
-    black: float = 0.0,
-    stated: int | None = None,
-) -> tuple[Levels, list[str]]:
-    """Estimate the levels (such as full scale) of the stored values of a single shot.
-
-    If many samples have the same largest value, they are saturated. This value does not become the full scale, because
-    all shots of a series must have the same full scale.
-
-    Args:
-        values: stored values, [K, ...].
-        container: see ``levels_of_capture``.
-        options: see ``levels_of_capture``.
-        bits: number of bits of a sensor value, or None if it is unknown.
-        black: see ``levels_of_capture``.
-        stated: see ``levels_of_capture``.
-
-    Returns:
-        The levels, and notes for the user.
-
-    Raises:
-        PolarguideError: a value exceeds ``--bits``, or ``--saturation`` is out of range.
-    """
-    largest = int(values.max())
-    counts = None
-    # Clipped values are a power of two minus 1. This test avoids the slow counting of all values.
-    may_pile_up = container == 16 and largest < FULL_16 and largest & (largest + 1) == 0
-    if may_pile_up and options.bits is None and options.saturation is None:
-        parts = (np.bincount(part.ravel(), minlength=FULL_16 + 1) for part in values)
-        counts = sum(parts, np.zeros(1, np.int64))
-    levels = estimate_levels(
-        largest, int(np.bitwise_or.reduce(values, None)), container,
-        bits=bits, black=black, saturation=options.saturation, counts=counts, stated=stated, alone=True,
-    )  # fmt: skip
-    return levels, level_notes(levels, counts, container, bits, stated)
 
 
 def levels_of_pictures(paths: Sequence[Path], options: SampledOptions) -> tuple[Levels | None, list[str]]:

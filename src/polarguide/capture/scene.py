@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from polarguide.capture import checks
-from polarguide.capture.colmap.model import ColmapModel, fit_camera, read_model, unseen_points, unused_poses
+from polarguide.capture.colmap.model import ColmapModel, fit_camera, read_model, unseen_points
 from polarguide.capture.exposures import FOUR, Angle
 from polarguide.capture.formats.pictures import TRANSFERS
 from polarguide.capture.layout import CaptureFiles, check_memory, find_layout, select_views, stated_size
@@ -674,7 +674,12 @@ def _gain_warnings(names: Sequence[str], gains: Sequence[tuple[float, float, flo
 
 def _pose_warnings(model: ColmapModel, all_names: list[str], data: Sequence[ViewData]) -> list[str]:
     """Return warnings about poses without pictures, and about intrinsics that were scaled to the picture size."""
-    warnings = unused_poses(model, all_names)
+    warnings = []
+    unused = sorted(set(model.names) - set(all_names))
+    if unused:
+        warnings.append(
+            f"The COLMAP model has poses for {len(unused)} images without pictures ({listed(unused)})."
+        )
     sizes = {item.name: (model.camera(item.name).width, model.camera(item.name).height) for item in data}
     scaled = [item.name for item in data if item.size != sizes[item.name]]
     if scaled:

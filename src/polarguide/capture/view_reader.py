@@ -18,7 +18,6 @@ from torch import Tensor
 from polarguide.capture import box_filter as boxes
 from polarguide.capture import checks
 from polarguide.capture.exposures import FOUR, LARGEST, Angle, Exposure, normalized
-from polarguide.capture.formats.headers import declared_size
 from polarguide.capture.formats.pictures import (
     MATERIAL_REMEDY,
     codes_of_floats,
@@ -26,9 +25,9 @@ from polarguide.capture.formats.pictures import (
     decode_materials,
     decode_picture,
     linear_codes,
-    read_picture,
     require_full_scale,
 )
+from polarguide.capture.formats.stored import declared_size, read_picture, require_alike, require_size
 from polarguide.capture.layout import CaptureFiles
 from polarguide.capture.metadata import GroundTruth, merges_exposures, read_ground_truth
 from polarguide.capture.point_exposures import ComparedPoints, PointExposures, PointSamples
@@ -512,15 +511,16 @@ def _read_pictures(files: Files, layout: CaptureFiles, name: str, transfer: str)
     whose largest value marks saturated pixels. The median may exceed 1 only if ``prepare`` merged exposures.
     """
     paths = layout.files(name)
-    pictures: list[NDArray[Any]] = []
-    for path in paths:
-        data = files.picture(path)
-        if pictures:
-            require_size(path, data, pictures[0].shape[:2], like=paths[0])
-        picture = decode_picture(path, data, keep_floats=True)
-        if pictures:
-            require_alike(path, picture, paths[0], pictures[0])
-        pictures.append(picture)
+    contents = [files.picture(path) for path in paths]
+    size = declared_size(contents[0])
+    for path, data in zip(paths, contents, strict=True):
+        if size is not None:
+            require_size(path, data, size[::-1], like=paths[0])
+    pictures = [
+        decode_picture(path, data, keep_floats=True) for path, data in zip(paths, contents, strict=True)
+    ]
+    for path, picture in zip(paths, pictures, strict=True):
+        require_alike(path, picture, paths[0], pictures[0])
     if pictures[0].dtype != np.float32:
         return pictures
     if all(picture.max() <= 1 for picture in pictures):
@@ -537,49 +537,6 @@ def _read_pictures(files: Files, layout: CaptureFiles, name: str, transfer: str)
         remedy="Remove the option.",
     )
     return pictures
-
-
-def require_size(path: Path, data: bytes, size: Sequence[int], *, like: Path | None = None) -> None:
-    """Refuse a picture of the wrong size by its header, before memory is allocated to decode it.
-
-    Args:
-        path: path of the file.
-        data: content of the file.
-        size: required height and width.
-        like: another file with the required size, which the message names.
-
-    Raises:
-        PolarguideError: the header states another size.
-    """
-    stated = declared_size(data)
-    if stated is not None and stated != (size[1], size[0]):
-        alike = "the size of the pictures" if like is None else f"the size of {'/'.join(like.parts[-2:])}"
-        raise PolarguideError(
-            path,
-            expected=f"{alike}, {size[1]}x{size[0]}",
-            found=f"{stated[0]}x{stated[1]}",
-            remedy="Create it again for these pictures."
-            if like is None
-            else "Export all pictures of a view with the same settings.",
-        )
-
-
-def require_alike(path: Path, picture: NDArray[Any], first_path: Path, first: NDArray[Any]) -> None:
-    """Check that a picture has the same size and bit depth as the first picture of its view.
-
-    Raises:
-        PolarguideError: the size or the bit depth differs.
-    """
-    if (picture.shape, picture.dtype) != (first.shape, first.dtype):
-        own, expected = (
-            f"{p.shape[1]}x{p.shape[0]} with {p.dtype.itemsize * 8} bits" for p in (picture, first)
-        )
-        raise PolarguideError(
-            path,
-            expected=f"{expected} like {'/'.join(first_path.parts[-2:])}",
-            found=own,
-            remedy="Export all pictures of a view with the same settings.",
-        )
 
 
 def _read_optional(

@@ -41,7 +41,7 @@ VERBS = {
         "Train, evaluate and render the small scene that ships with the program.",
     ),
     "run": Verb(
-        "polarguide.cli.run",
+        "polarguide.cli.runs",
         "run_folder",
         "Go from a folder of pictures to a scene in a browser: prepare, inspect, train, eval and view.",
     ),

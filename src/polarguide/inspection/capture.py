@@ -18,7 +18,8 @@ from polarguide import optics
 from polarguide.capture.calibration import Calibration
 from polarguide.capture.colmap.model import ColmapModel, read_model
 from polarguide.capture.exposures import FOUR, Exposure
-from polarguide.capture.formats.pictures import TRANSFERS, decode_picture, read_picture
+from polarguide.capture.formats.pictures import TRANSFERS, decode_picture
+from polarguide.capture.formats.stored import read_picture
 from polarguide.capture.layout import CaptureFiles, find_layout, select_views
 from polarguide.capture.metadata import (
     Origin,

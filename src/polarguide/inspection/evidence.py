@@ -29,20 +29,18 @@ from polarguide.capture.angle_evidence import (
     sum_by_cluster,
 )
 from polarguide.capture.colmap.model import ColmapModel
-from polarguide.geometry.camera import Camera
-from polarguide.geometry.vectors import dot, unit
+from polarguide.geometry.camera import Camera, dot, unit
 from polarguide.inspection.capture import InspectedView
 from polarguide.methods import recipe_named
 from polarguide.raster import Backend
 from polarguide.runs.folder import resolve
 from polarguide.shading.gbuffer import RenderRequest, render
-from polarguide.training.angles.fits import gaussian_training
-from polarguide.training.context import TrainingContext
+from polarguide.training.angles.polarizers import gaussian_training
+from polarguide.training.context import TrainingContext, TrainingState
 from polarguide.training.losses import depth_normals
 from polarguide.training.priors import guide_normals
 from polarguide.training.recipe import Priors, Recipe
 from polarguide.training.settings import StepReport, TrainSettings
-from polarguide.training.state import TrainingState
 
 NORMALS = "normals of a short training"
 """Name of the evidence from normals in the report."""

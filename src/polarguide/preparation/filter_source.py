@@ -18,33 +18,35 @@ from numpy.typing import NDArray
 
 from polarguide.capture.angle_evidence import TO_DEVIATION
 from polarguide.capture.brackets import Bracket, MergedExposures, bracket_notes
-from polarguide.capture.calibration import LARGEST_IMBALANCE, pair_ratio
+from polarguide.capture.calibration import (
+    LARGEST_IMBALANCE,
+    apply_orientation,
+    as_displayed,
+    orientation_calibration,
+    pair_ratio,
+)
 from polarguide.capture.colmap.model import read_model
 from polarguide.capture.colmap.poses import Geometry
 from polarguide.capture.develop import (
     COMPARABLE,
     BracketedShots,
     LinearShots,
-    as_displayed,
     exposure_notes,
     levels_of_pictures,
     light_of_files,
     pair_gains,
     require_one,
+    shift_notes,
     stated_exposures,
 )
-from polarguide.capture.exposure_files import all_exposures, exposure_tables
 from polarguide.capture.exposures import TABLE, Angle, angle_text, turned
 from polarguide.capture.filter.camera_files import (
     Lens,
-    apply_orientation,
     camera_groups,
     is_camera_raw,
     orientation,
-    orientation_calibration,
     stored_frame,
 )
-from polarguide.capture.filter.develop import shift_notes
 from polarguide.capture.filter.encoding import (
     TransferDecision,
     kind_of_file,
@@ -58,8 +60,9 @@ from polarguide.capture.filter.shots import (
     read_stack,
     require_four_shots,
 )
-from polarguide.capture.formats.pictures import decode_mask, decode_picture, read_picture, stated_size
-from polarguide.capture.layout import require_memory_of_each
+from polarguide.capture.formats.pictures import decode_mask, decode_picture
+from polarguide.capture.formats.stored import read_picture, stated_size
+from polarguide.capture.layout import all_exposures, exposure_tables, require_memory_of_each
 from polarguide.capture.point_exposures import (
     FEWEST,
     ComparedPoints,
@@ -74,16 +77,18 @@ from polarguide.core.errors import PolarguideWarning, require
 from polarguide.core.files import write_whole
 from polarguide.core.progress import Advance, Reporter
 from polarguide.optics.color import srgb_decode_array
-from polarguide.preparation.journal import (
+from polarguide.preparation.settings import FilterSettings, SinglesSettings
+from polarguide.preparation.source import (
+    DevelopedView,
     ExposureRecord,
     Factor,
     Measured,
+    Source,
+    Stored,
     StoredRounding,
     ViewRecord,
     stops_record,
 )
-from polarguide.preparation.settings import FilterSettings, SinglesSettings
-from polarguide.preparation.source import DevelopedView, Source, Stored
 
 _JUDGED_VIEWS = 8
 _GAINS = {
@@ -218,11 +223,8 @@ class ShotsSource(Source):
         """Return the path of a photograph relative to the folder of the capture."""
         return path.relative_to(self._root).as_posix()
 
-    def _linear(self, view: str, measured: ShotsMeasured, *, align: bool) -> LinearShots:
-        """Return the linear shots of a view. They are aligned if ``align`` is True."""
-        return self._merged(view, measured.levels, measured.transfer, align=align)
-
     def _merged(self, view: str, levels: Levels | None, transfer: str, *, align: bool) -> LinearShots:
+        """Return the linear shots of a view. They are aligned if ``align`` is True."""
         read = BracketedShots.read(self._of_view[view], levels)
         if self.used_as_stored(view):
             read = replace(read, shots=[replace(shots, orientation=1) for shots in read.shots])
@@ -333,7 +335,7 @@ class FilterSource(ShotsSource):
         angles, rotate for display.
         """
         settings = self._settings
-        shots = self._linear(view, measured, align=settings.align)
+        shots = self._merged(view, measured.levels, measured.transfer, align=settings.align)
         paths = self._of_view[view]
         stated = [measured.light.get(self._name(path), 1.0) for path in paths]
         linear, exposures, warning = shots.evenly_exposed([path.name for path in paths], stated, settings)
@@ -446,7 +448,7 @@ class SinglesSource(ShotsSource):
         settings = self._settings
         singles = self._singles[view]
         usual = [shot.angle for shot in singles] == list(ANGLES)
-        shots = self._linear(view, measured, align=settings.align and usual)
+        shots = self._merged(view, measured.levels, measured.transfer, align=settings.align and usual)
         turn = orientation_calibration(shots.orientation)
         angles = [turned(turned(shot.angle, settings.calibration), turn) for shot in singles]
         exposures = [

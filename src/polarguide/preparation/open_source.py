@@ -12,24 +12,32 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from polarguide.capture.calibration import QUARTER_TURNS, TURNS
 from polarguide.capture.colmap.model import holds_model, view_of_name
 from polarguide.capture.colmap.poses import Poses
 from polarguide.capture.datasets.readers import PISR_SENSOR, detect_dataset, open_dataset
-from polarguide.capture.exposure_files import index_shot_files, list_shot_files, shot_stem
 from polarguide.capture.exposures import TABLE, angles_of_names, folders_of_angles, parse_angle
-from polarguide.capture.filter.camera_files import QUARTER_TURNS, TURNS
-from polarguide.capture.filter.consecutive import (
+from polarguide.capture.filter.shots import (
+    SHOT_SUFFIXES,
     extract_frames,
+    find_shots,
     find_videos,
     shots_of_one_place,
 )
-from polarguide.capture.filter.shots import SHOT_SUFFIXES, find_shots
-from polarguide.capture.formats.pictures import SUFFIXES, decode_picture, read_picture
-from polarguide.capture.layout import angle_folders, describe_contents, numbered_like_angles
+from polarguide.capture.formats.pictures import decode_picture
+from polarguide.capture.formats.stored import SUFFIXES, read_picture
+from polarguide.capture.layout import (
+    angle_folders,
+    describe_contents,
+    index_shot_files,
+    list_shot_files,
+    numbered_like_angles,
+    shot_stem,
+)
 from polarguide.capture.pose_files import SUFFIXES as POSE_FILES
 from polarguide.capture.pose_files import TEST, parts_of_poses, read_parts
+from polarguide.capture.sensor.mosaics import RAW_SUFFIXES
 from polarguide.capture.sensor.pattern import SENSOR_NAMES
-from polarguide.capture.sensor.raw_file import RAW_SUFFIXES
 from polarguide.capture.view import ANGLES, listed
 from polarguide.core.errors import PolarguideError, PolarguideWarning, require
 from polarguide.core.files import require_folder

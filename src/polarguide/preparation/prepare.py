@@ -22,11 +22,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polarguide import __version__
+from polarguide.capture.calibration import TURNS
 from polarguide.capture.colmap.model import read_model
 from polarguide.capture.colmap.poses import Geometry, Poses
 from polarguide.capture.colmap.sfm import LEAST_VIEWS, NotConnectedError, add_points, reconstruct, tone_mapped
-from polarguide.capture.filter.camera_files import TURNS
-from polarguide.capture.filter.consecutive import chosen_matching
+from polarguide.capture.filter.shots import chosen_matching
 from polarguide.capture.raw_options import SampledOptions, changed
 from polarguide.capture.sensor.pattern import MosaicOptions
 from polarguide.capture.view import ANGLES, listed
@@ -53,16 +53,6 @@ from polarguide.core.records import decode, option_name, read_record, shortened,
 from polarguide.core.system import only_writer
 from polarguide.core.text import canonical
 from polarguide.preparation.filter_source import write_exposure_table
-from polarguide.preparation.journal import (
-    Journal,
-    Measured,
-    Request,
-    State,
-    ViewRecord,
-    WarpRecord,
-    changed_entry,
-    request_of,
-)
 from polarguide.preparation.open_source import (
     POSE_NAMES,
     frames_of_video,
@@ -72,7 +62,18 @@ from polarguide.preparation.open_source import (
     settle_pose_frames,
 )
 from polarguide.preparation.settings import PrepareSettings, known_intrinsics
-from polarguide.preparation.source import Source, develop_view
+from polarguide.preparation.source import (
+    Journal,
+    Measured,
+    Request,
+    Source,
+    State,
+    ViewRecord,
+    WarpRecord,
+    changed_entry,
+    develop_view,
+    request_of,
+)
 
 JOURNAL = "prepare.json"
 SCENE = "scene.json"

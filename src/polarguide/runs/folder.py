@@ -34,9 +34,9 @@ from polarguide.core.files import atomic, in_utf8, make_folder, read_file, requi
 from polarguide.core.options import Transfer, index_of
 from polarguide.core.records import LARGEST_RECORD, decode
 from polarguide.training.checked import refuse_foreign
+from polarguide.training.context import SavedState, TrainingState
 from polarguide.training.recipe import Recipe
 from polarguide.training.settings import STEPS, ResolvedSettings, TrainSettings
-from polarguide.training.state import SavedState, TrainingState
 
 CONFIGURATION = "run.json"
 CHECKPOINT = "checkpoint.safetensors"

@@ -41,8 +41,7 @@ from polarguide.runs.callbacks import CURVE_POINTS, HeldOutScore
 from polarguide.runs.folder import PLY
 from polarguide.runs.model import GaussianModel, write_run_ply
 from polarguide.shading.result import RenderResult
-from polarguide.training.angles.fits import AngleFits
-from polarguide.training.angles.polarizers import REMEDY, Judgment, Polarizers, predicts_filters
+from polarguide.training.angles.polarizers import REMEDY, AngleFits, Judgment, Polarizers, predicts_filters
 from polarguide.training.callback import Callback
 from polarguide.training.loop import TrainingLoop
 from polarguide.training.metals.observations import blended, evenly

@@ -27,7 +27,7 @@ from polarguide.raster.surface import alpha_in_front
 from polarguide.shading.gbuffer import RenderRequest, render, single_colors, splats
 from polarguide.shading.model import Light, Parameters, ShadingModel
 from polarguide.shading.result import LAYERS, POLARIZED, RenderResult
-from polarguide.training.state import TrainingState
+from polarguide.training.context import TrainingState
 
 Within = Callable[[Tensor], Tensor]
 """Function that maps positions [N, 3] in the scene to a mask [N], True for visible positions."""

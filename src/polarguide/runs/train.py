@@ -43,14 +43,13 @@ from polarguide.runs.health import (
 from polarguide.runs.memory_plan import MemoryPlan, pixels_of, plan_memory
 from polarguide.runs.model import GaussianModel
 from polarguide.runs.opened import OpenedRun, read_scene, trained_scene
-from polarguide.training.angles.fits import gaussian_training
+from polarguide.training.angles.polarizers import gaussian_training
 from polarguide.training.callback import AnyCallback
-from polarguide.training.context import TrainingContext
+from polarguide.training.context import TrainingContext, TrainingState
 from polarguide.training.loop import TrainingLoop
 from polarguide.training.metals.search import warn_of_unused_materials
 from polarguide.training.recipe import Recipe
 from polarguide.training.settings import ResolvedSettings, TrainSettings
-from polarguide.training.state import TrainingState
 from polarguide.training.storage import ViewStore
 
 

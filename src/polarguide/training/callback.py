@@ -9,9 +9,9 @@ from typing import Any, Generic, TypeVar
 from torch import Tensor
 
 from polarguide.core.errors import PolarguideError
+from polarguide.training.context import SavedState
 from polarguide.training.recipe import Position
 from polarguide.training.settings import ResolvedSettings, StepReport
-from polarguide.training.state import SavedState
 from polarguide.training.targets import Step
 
 LoopKind = TypeVar("LoopKind", contravariant=True)

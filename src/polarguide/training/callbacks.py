@@ -12,19 +12,18 @@ from torch import Tensor
 from polarguide.capture import View
 from polarguide.core.errors import require
 from polarguide.gaussians.densify import DensityStatistics, densify, free_space
-from polarguide.geometry.camera import Camera, seen_at
-from polarguide.geometry.vectors import unit
+from polarguide.geometry.camera import Camera, seen_at, unit
 from polarguide.raster import Rasterize
 from polarguide.raster.magnification import footprints
 from polarguide.shading.gbuffer import RenderRequest, render, splats
 from polarguide.shading.model import Parameters, ShadingModel
 from polarguide.training.callback import AnyCallback, Callback
+from polarguide.training.context import TrainingState, seeded
 from polarguide.training.loop import TrainingLoop
 from polarguide.training.metals.observations import index_offsets
 from polarguide.training.metals.search import MetalSearch
 from polarguide.training.recipe import Position, Propagation
 from polarguide.training.settings import StepReport
-from polarguide.training.state import TrainingState, seeded
 from polarguide.training.targets import Step
 
 

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from polarguide.training.context import ANGLE_COLUMNS
 from polarguide.training.recipe import Recipe
-from polarguide.training.state import ANGLE_COLUMNS
 
 LARGEST_VALUE = 1e8
 """Largest absolute value of a parameter without a range of its own."""

@@ -14,12 +14,11 @@ from polarguide.capture.variants import SmallerViews, empty_pixels
 from polarguide.geometry.camera import Camera
 from polarguide.optics.color import srgb_encode
 from polarguide.shading.gbuffer import RenderRequest, render
-from polarguide.training.context import TrainingContext
+from polarguide.training.context import TrainingContext, seeded
 from polarguide.training.losses import Weights
 from polarguide.training.metals.observations import index_picture, metalness_share
 from polarguide.training.priors import Flat, Unguided, flat_surfaces, unguided, view_priors
 from polarguide.training.recipe import Priors, Recipe
-from polarguide.training.state import seeded
 from polarguide.training.storage import Entry, Packed, packed, stored_values
 from polarguide.training.targets import PartialView, StepTargets, ViewPriors
 

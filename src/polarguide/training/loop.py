@@ -17,11 +17,10 @@ from polarguide.shading.model import PLAIN
 from polarguide.shading.result import COLOR_CHANNELS
 from polarguide.training.behind import fade_behind
 from polarguide.training.callback import AnyCallback, Loop, check_known, stateful
-from polarguide.training.context import TrainingContext
+from polarguide.training.context import TrainingContext, TrainingState, first_state
 from polarguide.training.feed import Feed
 from polarguide.training.losses import step_loss
 from polarguide.training.recipe import Schedule, Stage
-from polarguide.training.state import TrainingState, first_state
 from polarguide.training.targets import Step
 
 

@@ -1,8 +1,7 @@
 """Local web viewer for trained runs and for trainings in progress."""
 
 from polarguide.core.options import LOOPBACK
-from polarguide.viewer.cameras import photographs
-from polarguide.viewer.scenery import Scenery, run_scenery, training_scenery
+from polarguide.viewer.scenery import Scenery, photographs, run_scenery, training_scenery
 from polarguide.viewer.server import Viewer, viewing_address
 
 __all__ = [

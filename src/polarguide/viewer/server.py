@@ -36,11 +36,16 @@ from polarguide.runs.opened import OpenedRun
 from polarguide.runs.train import Ends, Look
 from polarguide.shading.model import ShadingModel, radiance_cubemap
 from polarguide.training.loop import TrainingLoop
-from polarguide.viewer.cameras import Photograph, photographs
 from polarguide.viewer.guard import Accepts, Gate, checked_message, guarded
-from polarguide.viewer.panel import PanelOptions
-from polarguide.viewer.scenery import UNCHANGED, Scenery, run_scenery, training_scenery
-from polarguide.viewer.session import Session
+from polarguide.viewer.scenery import (
+    UNCHANGED,
+    Photograph,
+    Scenery,
+    photographs,
+    run_scenery,
+    training_scenery,
+)
+from polarguide.viewer.session import PanelOptions, Session
 
 REFRESH = 1.0  # least time in seconds between two pictures of a training
 SHARE = 10.0  # least time in units of the duration of the last picture

@@ -13,13 +13,12 @@ import torch
 from torch import Tensor
 
 from polarguide.capture import Scene, View
-from polarguide.geometry.camera import Camera
-from polarguide.geometry.vectors import dot, unit
+from polarguide.geometry.camera import Camera, dot, unit
 from polarguide.optics import aolp, dolp, lens_frame, luminance
 from polarguide.optics.color import srgb_encode
 from polarguide.training.callback import Loop
+from polarguide.training.context import seeded
 from polarguide.training.settings import ResolvedSettings
-from polarguide.training.state import seeded
 from polarguide.training.storage import Packed, ViewStore, packed, stored_values
 from polarguide_bench.gnerp.march import RaySamples, march
 from polarguide_bench.gnerp.recipe import NeuralRecipe

@@ -29,8 +29,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from polarguide.capture.develop import sample_blocks
 from polarguide.capture.layout import describe_contents, index_files
+from polarguide.capture.sensor.mosaics import RAW_SUFFIXES, RawFormat, read_mosaic, sample_blocks
 from polarguide.capture.sensor.pattern import (
     SIDE,
     Levels,
@@ -40,7 +40,6 @@ from polarguide.capture.sensor.pattern import (
     require_kind,
     sensor_pattern,
 )
-from polarguide.capture.sensor.raw_file import RAW_SUFFIXES, RawFormat, read_mosaic
 from polarguide.core.errors import require
 from polarguide.core.files import require_folder
 from polarguide.core.progress import Reporter

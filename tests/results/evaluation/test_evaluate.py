@@ -21,8 +21,14 @@ from polarguide.api.runs import Run, open_run
 from polarguide.capture import View
 from polarguide.capture.exposures import FOUR, Exposure
 from polarguide.results.evaluation import evaluate
-from polarguide.results.evaluation.evaluate import cross_fitted, frames_per_second
-from polarguide.results.evaluation.record import COMMIT, NOT_TRAINING, code_digest, commit
+from polarguide.results.evaluation.evaluate import (
+    COMMIT,
+    NOT_TRAINING,
+    code_digest,
+    commit,
+    cross_fitted,
+    frames_per_second,
+)
 
 
 @pytest.fixture

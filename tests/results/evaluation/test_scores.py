@@ -8,7 +8,7 @@ import pytest
 import torch
 from faults import Fault
 
-from polarguide.results.evaluation import metrics, record, scores, table
+from polarguide.results.evaluation import evaluate, metrics, scores, table
 from polarguide.results.evaluation.table import HIGHEST_PSNR, VIEW_METRICS
 from polarguide.results.evaluation.target import ViewTarget
 from polarguide.shading.result import RenderResult
@@ -171,7 +171,7 @@ def test_metrics_file(tmp_path, views):
     path = tmp_path / "metrics.json"
     path.write_text("old")
     run = {"fps": 12.5, "gaussians": 1000, "train_seconds": math.nan}
-    written = record.write_metrics(path, views=views, run=run, provenance=PROVENANCE)
+    written = evaluate.write_metrics(path, views=views, run=run, provenance=PROVENANCE)
 
     def refuse(token):
         raise AssertionError(f"{token} is not JSON")
@@ -183,7 +183,7 @@ def test_metrics_file(tmp_path, views):
     assert (read["fps"], read["gaussians"], read["train_seconds"], read["steps"]) == (12.5, 1000, None, None)
     assert read["provenance"] == PROVENANCE
     assert [p.name for p in tmp_path.iterdir()] == ["metrics.json"]
-    record.validate_metrics(read)
+    evaluate.validate_metrics(read)
 
 
 ERRORS = {
@@ -200,16 +200,16 @@ ERRORS = {
 def test_errors_by_object_are_part_of_the_record(tmp_path, views):
     objects, materials = {"cup": {"material": "dielectric", **ERRORS}}, {"dielectric": ERRORS}
     given = {"views": views, "run": {}, "provenance": PROVENANCE}
-    record.write_metrics(tmp_path / "metrics.json", **given, objects=objects, materials=materials)
-    read = record.read_metrics(tmp_path)
+    evaluate.write_metrics(tmp_path / "metrics.json", **given, objects=objects, materials=materials)
+    read = evaluate.read_metrics(tmp_path)
     assert (read["objects"], read["materials"]) == (objects, materials)
-    record.write_metrics(tmp_path / "metrics.json", **given)
-    assert record.read_metrics(tmp_path)["objects"] == {}
+    evaluate.write_metrics(tmp_path / "metrics.json", **given)
+    assert evaluate.read_metrics(tmp_path)["objects"] == {}
     wrong = {"cup": {key: value for key, value in objects["cup"].items() if key != "stokes_error"}}
     path, materials = tmp_path / "metrics.json", {"metal": {**ERRORS, "psnr": "x"}}
-    Fault(expected="the field stokes_error").raised_by(record.write_metrics, path, **given, objects=wrong)
+    Fault(expected="the field stokes_error").raised_by(evaluate.write_metrics, path, **given, objects=wrong)
     Fault("psnr)", "a number or null", '"x"').raised_by(
-        record.write_metrics, path, **given, materials=materials
+        evaluate.write_metrics, path, **given, materials=materials
     )
 
 
@@ -217,7 +217,7 @@ def test_failed_write_leaves_the_old_file(tmp_path, views):
     path = tmp_path / "metrics.json"
     path.write_text("old")
     with pytest.raises(TypeError):
-        record.write_metrics(path, views=views, run={}, provenance={**PROVENANCE, "note": object()})
+        evaluate.write_metrics(path, views=views, run={}, provenance={**PROVENANCE, "note": object()})
     assert path.read_text() == "old"
     assert len(list(tmp_path.iterdir())) == 1
 
@@ -254,17 +254,17 @@ def set_at(tree, path, value):
 def test_schema_names_what_is_wrong(tmp_path, views, path, value, place, expected, found):
     for scored in views.values():
         scored.update(lpips=None, lpips_reason="not wanted here")
-    good = record.write_metrics(tmp_path / "metrics.json", views=views, run={}, provenance=dict(PROVENANCE))
+    good = evaluate.write_metrics(tmp_path / "metrics.json", views=views, run={}, provenance=dict(PROVENANCE))
     set_at(good, path, value)
-    Fault(place, expected, found).raised_by(record.validate_metrics, good, "m.json")
+    Fault(place, expected, found).raised_by(evaluate.validate_metrics, good, "m.json")
 
 
 def test_a_record_is_read_from_its_run(tmp_path, views):
-    Fault("metrics.json", "the scores of a run", "none").raised_by(record.read_metrics, tmp_path)
-    written = record.write_metrics(tmp_path / "metrics.json", views=views, run={}, provenance=PROVENANCE)
-    assert record.read_metrics(tmp_path) == written
+    Fault("metrics.json", "the scores of a run", "none").raised_by(evaluate.read_metrics, tmp_path)
+    written = evaluate.write_metrics(tmp_path / "metrics.json", views=views, run={}, provenance=PROVENANCE)
+    assert evaluate.read_metrics(tmp_path) == written
     (tmp_path / "metrics.json").write_text(json.dumps(written | {"fps": math.nan}))
-    Fault("metrics.json (fps)", "finite").raised_by(record.read_metrics, tmp_path)
+    Fault("metrics.json (fps)", "finite").raised_by(evaluate.read_metrics, tmp_path)
 
 
 def test_worst_views_have_the_lowest_psnr_and_the_most_haze(views):

@@ -25,15 +25,14 @@ from polarguide.geometry.camera import Camera
 from polarguide.geometry.scene_frame import scene_frame
 from polarguide.optics.color import srgb_decode_array
 from polarguide.results.export.model import build
+from polarguide.results.export.model.bake import Surroundings, arriving_light, irradiance
 from polarguide.results.export.model.build import charted_subject, require_room, textured_model
 from polarguide.results.export.model.gltf import Textured, color_pixels, write_glb
-from polarguide.results.export.model.irradiance import Surroundings, arriving_light, irradiance
 from polarguide.results.export.model.topology import Topology, cleaned, topology
 from polarguide.results.export.model.unwrap import Unwrapped, rasterized_texels, unwrap
 from polarguide.results.export.placement import IN_PLACE
-from polarguide.results.rendering.mesh import ColoredMesh, Surface
+from polarguide.results.rendering.mesh import ColoredMesh, Surface, subject_of
 from polarguide.results.rendering.relight import mirrored_light
-from polarguide.results.rendering.subject import subject_of
 from polarguide.shading.deferred import DeferredShading
 from polarguide.shading.model import radiance_cubemap
 from polarguide.shading.result import RenderResult

@@ -22,9 +22,9 @@ from polarguide.core.progress import SILENT
 from polarguide.geometry.camera import Camera
 from polarguide.geometry.scene_frame import scene_frame
 from polarguide.optics.color import srgb_encode_array
+from polarguide.results.export.formats import export_normals
 from polarguide.results.export.placement import ALL, Origin, Placement, comments
-from polarguide.results.export.views import export_normals
-from polarguide.results.rendering.subject import Subject
+from polarguide.results.rendering.mesh import Subject
 from polarguide.shading.result import RenderResult
 
 RADIUS = 0.8

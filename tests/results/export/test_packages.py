@@ -28,7 +28,7 @@ from polarguide.optics.color import srgb_decode_array, srgb_encode_array
 from polarguide.results.export.model import build
 from polarguide.results.export.model.gltf import Textured
 from polarguide.results.export.usd import write_splat_usdz, write_usdz
-from polarguide.results.rendering.subject import subject_of
+from polarguide.results.rendering.mesh import subject_of
 from polarguide.runs.model import write_run_ply
 
 trimesh = pytest.importorskip("trimesh")

@@ -26,7 +26,7 @@ from polarguide.results.export.web_page import share_page
 from polarguide.shading.gbuffer import render
 from polarguide.shading.model import ShadingModel
 from polarguide.shading.result import RenderResult
-from polarguide.training.state import TrainingState
+from polarguide.training.context import TrainingState
 from polarguide.visualization.figures import layer_picture
 
 pytestmark = pytest.mark.slow

@@ -18,7 +18,6 @@ from polarguide.core.errors import PolarguideError
 from polarguide.geometry.camera import Camera
 from polarguide.geometry.scene_frame import scene_frame
 from polarguide.results.export.mesh import write_mesh
-from polarguide.results.rendering.film import write_video
 from polarguide.results.rendering.mesh import (
     Surface,
     box_around,
@@ -27,6 +26,7 @@ from polarguide.results.rendering.mesh import (
     scene_mesh,
     seen_points,
 )
+from polarguide.results.rendering.pictures import write_video
 from polarguide.results.rendering.relight import (
     cubemap_of_panorama,
     needs_radiance,

@@ -17,9 +17,8 @@ from bracketed import write_bracket
 
 from polarguide.core.progress import Reporter
 from polarguide.geometry.polarizer import ANGLES
-from polarguide_shots.measurement.line import measure_shots
+from polarguide_shots.measurement.line import measure_shots, watch_folder
 from polarguide_shots.measurement.table import CSV, LINES
-from polarguide_shots.measurement.watch import watch_folder
 from polarguide_shots.options import MeasureOptions, ShotOptions, WatchOptions
 from tests.shots.test_read import PLAIN, write_four
 

@@ -19,13 +19,12 @@ from polarguide.capture.exposures import FOUR, Exposure, read_table
 from polarguide.capture.variants import select_exposures
 from polarguide.methods import RECIPES, recipe_named
 from polarguide.runs.health import report_polarizers
-from polarguide.training.angles.fits import gaussian_training
-from polarguide.training.angles.polarizers import Polarizers
+from polarguide.training.angles.polarizers import Polarizers, gaussian_training
 from polarguide.training.checked import refuse_foreign
+from polarguide.training.context import TrainingState
 from polarguide.training.loop import TrainingLoop
 from polarguide.training.recipe import AngleRules, Recipe
 from polarguide.training.settings import TrainSettings
-from polarguide.training.state import TrainingState
 
 STOKES = RECIPES["polarguide-stokes"]
 WHOLE = make_scene()

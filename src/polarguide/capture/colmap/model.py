@@ -22,7 +22,7 @@ from torch import Tensor
 
 from polarguide.core.errors import PolarguideError, require
 from polarguide.core.files import read_file
-from polarguide.core.text import canonical, decimal_comma, listed
+from polarguide.core.text import canonical, decimal_comma
 from polarguide.geometry.camera import FARTHEST, LENS, Camera, can_be_lens, quaternion, seen_at
 
 MODELS = {
@@ -415,14 +415,6 @@ def fit_camera(camera: Camera, width: int, height: int, *, folder: Path, view: s
         remedy="Use intrinsics of these pictures, or pictures of the size that COLMAP used (without a crop).",
     )
     return camera.scaled(width / camera.width, width, height)
-
-
-def unused_poses(model: ColmapModel, names: list[str]) -> list[str]:
-    """Return a list with a warning if the model has images without a view in the capture; otherwise an empty list."""
-    unused = sorted(set(model.names) - set(names))
-    if not unused:
-        return []
-    return [f"The COLMAP model has poses for {len(unused)} images without pictures ({listed(unused)})."]
 
 
 def _model_files(root: Path, itself: bool = True) -> list[tuple[Path, str]]:

@@ -26,7 +26,7 @@ from polarguide.capture.colmap.model import (
     require_sound,
     second_model,
 )
-from polarguide.capture.filter.develop import remapped_mask
+from polarguide.capture.develop import remapped_mask
 from polarguide.core.errors import PolarguideError, PolarguideWarning, require
 from polarguide.core.text import listed
 

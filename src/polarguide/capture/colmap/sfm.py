@@ -25,7 +25,8 @@ from numpy.typing import NDArray
 from polarguide.capture.colmap import steps
 from polarguide.capture.colmap.model import PosedCamera, colmap_camera, load_model, posed_model
 from polarguide.capture.filter.camera_files import Lens
-from polarguide.capture.formats.pictures import decode_mask, decode_picture, read_picture
+from polarguide.capture.formats.pictures import decode_mask, decode_picture
+from polarguide.capture.formats.stored import read_picture
 from polarguide.capture.write import write_png_file
 from polarguide.core.errors import PolarguideError, require
 from polarguide.core.files import make_folder, write_whole, writing
@@ -523,6 +524,23 @@ def _nearest_to_axes(cameras: list[PosedCamera]) -> tuple[Points, float]:
     return center, max(reach, 1e-6)
 
 
+def _projected(
+    places: Points, camera: PosedCamera, lens: pycolmap.Camera
+) -> tuple[NDArray[np.bool_], NDArray[np.int64], NDArray[np.int64]]:
+    """Project points [N, 3] into a picture.
+
+    Returns:
+        A mask [N] of the points in the picture; and the row and the column of the pixel of each of them.
+    """
+    local = places @ camera.rotation.T + camera.translation
+    before = local[:, 2] > 1e-6
+    where = np.full((len(places), 2), -1.0)
+    where[before] = np.nan_to_num(np.asarray(lens.img_from_cam(local[before])), nan=-1.0)
+    hit = before & (where >= 0).all(axis=1) & (where < [camera.width, camera.height]).all(axis=1)
+    column, row = where[hit].astype(np.int64).T
+    return hit, row, column
+
+
 def _visible_to_most(
     places: Points,
     cameras: Mapping[str, PosedCamera],
@@ -533,14 +551,9 @@ def _visible_to_most(
     counts = np.zeros(len(places))
     inside = np.zeros(len(places))
     for view, camera in cameras.items():
-        local = places @ camera.rotation.T + camera.translation
-        before = local[:, 2] > 1e-6
-        where = np.full((len(places), 2), -1.0)
-        where[before] = np.nan_to_num(np.asarray(pixels[view].img_from_cam(local[before])), nan=-1.0)
-        hit = before & (where >= 0).all(axis=1) & (where < [camera.width, camera.height]).all(axis=1)
+        hit, row, column = _projected(places, camera, pixels[view])
         counts += hit
         if view in masks:
-            column, row = where[hit].astype(int).T
             inside[hit] += masks[view][row, column]
     enough = counts >= max(1.0, _SHARE_OF_VIEWS * len(cameras))
     return np.asarray(enough & (inside >= _SHARE_IN_MASKS * counts)) if masks else np.asarray(enough)
@@ -672,7 +685,7 @@ def _sample(
         remedy="Check the poses (world to camera, axes right, down, forward), or use a model with points.",
     )
     model = load_model(start, ".bin")
-    for place, color in zip(places, _colors(folder, cameras, places), strict=True):
+    for place, color in zip(places, colors_of_points(folder, cameras, places), strict=True):
         model.add_point3D(place, pycolmap.Track(), color)
     shutil.rmtree(trial, ignore_errors=True)
     make_folder(trial)
@@ -684,7 +697,7 @@ def _sample(
     return {"from": f"random samples in {kind}", "count": len(places), "triangulated": triangulated}
 
 
-def _colors(
+def colors_of_points(
     folder: Path, cameras: Mapping[str, PosedCamera], places: NDArray[np.float64]
 ) -> NDArray[np.uint8]:
     """Return the color of each point [N, 3] as RGB, [N, 3]. It is the mean over the photographs that show the point."""
@@ -694,15 +707,7 @@ def _colors(
     for view in views[:: max(1, len(views) // 8)]:
         path = folder / "images" / f"{view}.png"
         picture = decode_picture(path, read_picture(path))
-        camera = cameras[view]
-        local = places @ camera.rotation.T + camera.translation
-        plain = colmap_camera(camera)  # projected without distortion
-        focal = np.array([plain.focal_length_x, plain.focal_length_y])
-        center = np.array([plain.principal_point_x, plain.principal_point_y])
-        pixel = local[:, :2] / np.maximum(local[:, 2:], 1e-9) * focal + center
-        size = np.array([camera.width, camera.height])
-        inside = (local[:, 2] > 0) & (pixel >= 0).all(axis=1) & (pixel < size).all(axis=1)
-        column, row = pixel[inside].astype(int).T
+        inside, row, column = _projected(places, cameras[view], colmap_camera(cameras[view]))
         total[inside] += cv2.blur(picture, (3, 3))[row, column]
         counts[inside] += 1
     return np.rint(np.where(counts[:, None] > 0, total / np.maximum(counts, 1)[:, None], 128)).astype(

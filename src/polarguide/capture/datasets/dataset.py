@@ -17,16 +17,14 @@ from scipy.linalg import rq
 from polarguide.capture.calibration import Sense
 from polarguide.capture.colmap.model import PosedCamera
 from polarguide.capture.formats.pictures import (
-    SUFFIXES,
     decode_mask,
-    decode_stored,
     finite_numbers,
     read_arrays,
-    read_picture,
     read_radiance,
     require_camera,
     wrong_camera,
 )
+from polarguide.capture.formats.stored import SUFFIXES, decode_stored, read_picture
 from polarguide.capture.layout import index_files
 from polarguide.core.errors import PolarguideError, PolarguideWarning, require
 from polarguide.core.text import listed

@@ -34,19 +34,21 @@ from polarguide.capture.datasets.dataset import (
     require_same_shape,
     stokes_dataset,
 )
-from polarguide.capture.formats.headers import LARGEST_PIXELS
 from polarguide.capture.formats.pictures import (
-    SUFFIXES,
     array_kind,
     array_size,
     decode_arrays,
     decode_picture,
-    decode_stored,
     finite_numbers,
     linear_codes,
     read_array,
     read_arrays,
     read_exr,
+)
+from polarguide.capture.formats.stored import (
+    LARGEST_PIXELS,
+    SUFFIXES,
+    decode_stored,
     read_picture,
     stated_size,
 )

@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from PIL import Image
 from PIL.ExifTags import IFD, Base
 
-from polarguide.capture.calibration import Calibration
-from polarguide.capture.formats.headers import (
+from polarguide.capture.formats.pictures import array_kind
+from polarguide.capture.formats.stored import (
     LARGEST_PIXELS,
     ORIENTATION,
     heif_orientation,
@@ -31,8 +31,8 @@ from polarguide.capture.formats.headers import (
     opened_picture,
     picture_kind,
     png_chunk,
+    read_picture,
 )
-from polarguide.capture.formats.pictures import array_kind, read_picture
 from polarguide.core.errors import PolarguideError, optional_import, require
 from polarguide.core.files import read_file
 from polarguide.core.text import listed
@@ -156,23 +156,6 @@ def libraw_parameters() -> dict[str, Any]:
     return settings
 
 
-_MIRRORED = (2, 4, 5, 7)
-QUARTER_TURNS = (5, 6, 7, 8)
-"""EXIF orientations that exchange width and height."""
-INVERSE = {code: {6: 8, 8: 6}.get(code, code) for code in range(1, 9)}
-"""EXIF orientation that undoes each orientation."""
-TURNS = {
-    2: "mirrored left to right",
-    3: "turned by 180 degrees",
-    4: "mirrored top to bottom",
-    5: "mirrored along the falling diagonal",
-    6: "turned by 90 degrees clockwise",
-    7: "mirrored along the rising diagonal",
-    8: "turned by 90 degrees counter-clockwise",
-}
-"""Description of the change from the stored to the displayed picture, for each EXIF orientation except 1."""
-
-
 def orientation(data: bytes) -> int:
     """Return the EXIF orientation of a picture file, 1 to 8. Without a valid tag it is 1, which means no rotation.
 
@@ -182,23 +165,6 @@ def orientation(data: bytes) -> int:
         return heif_orientation(data)
     value = tags_of(data).get(ORIENTATION)
     return value if isinstance(value, int) and 1 <= value <= 8 else 1
-
-
-def apply_orientation(pixels: NDArray[Any], code: int) -> NDArray[Any]:
-    """Rotate or mirror pixels [H, W, ...] for display according to an EXIF orientation."""
-    if code in (5, 7):
-        pixels = pixels.swapaxes(0, 1)
-        return np.rot90(pixels, 2) if code == 7 else pixels
-    if code in (2, 4):
-        return np.flip(pixels, axis=1 if code == 2 else 0)
-    return np.rot90(pixels, {1: 0, 3: 2, 6: -1, 8: 1}[code])
-
-
-def orientation_calibration(code: int) -> Calibration:
-    """Return the sense and zero of polarizer angles that result from rotating or mirroring a picture for display."""
-    return Calibration(
-        sense="cw" if code in _MIRRORED else "ccw", zero=90.0 if code in QUARTER_TURNS else 0.0
-    )
 
 
 def tags_of(data: bytes) -> dict[int, Any]:

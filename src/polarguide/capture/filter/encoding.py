@@ -25,14 +25,16 @@ from polarguide.capture import checks
 from polarguide.capture.exposures import Angle
 from polarguide.capture.filter.camera_files import is_camera_raw, number_of, tags_of
 from polarguide.capture.filter.shots import Shots
-from polarguide.capture.formats.headers import (
+from polarguide.capture.formats.pictures import linear_codes
+from polarguide.capture.formats.stored import (
     HIGH_RANGE,
     TIFFS,
     heif_colors,
+    is_lossy,
     picture_kind,
     png_chunk,
+    read_picture,
 )
-from polarguide.capture.formats.pictures import is_lossy, linear_codes, read_picture
 from polarguide.core.errors import PolarguideError, optional_import
 
 SRGB_EXPONENT = 2.22

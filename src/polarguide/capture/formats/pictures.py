@@ -1,50 +1,42 @@
-"""Read pictures, linear radiance and NumPy arrays. Sizes are checked before memory is allocated."""
+"""Decode photographs, masks, materials, linear radiance and NumPy arrays.
+
+Sizes are checked before memory is allocated.
+"""
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import io
 import math
 import re
-import tokenize
 import zipfile
-import zlib
 from collections.abc import Collection, Sequence
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import cv2
 import numpy as np
 import tifffile
 from numpy.typing import NDArray
 
-from polarguide.capture.formats.headers import (
+from polarguide.capture.formats.stored import (
+    BROKEN,
     JPEG_IN_TIFF,
     LARGEST_PIXELS,
     TIFFS,
-    UnreadableTiffError,
+    array_header,
     damaged,
-    declared_size,
-    decode_tiff,
-    find_damage,
-    heif_pixels,
+    decode_stored,
+    exr_size,
+    hdr_size,
     picture_kind,
-    pnm_full_scale,
     rescaled,
-    significant_bits,
-    tiff_full_scale,
-    tiff_size,
+    stated_full_scale,
 )
 from polarguide.core.errors import PolarguideError, optional_import, require
-from polarguide.core.files import LARGEST_FILE, in_utf8, read_file
+from polarguide.core.files import in_utf8, read_file
 from polarguide.optics.color import srgb_decode_array
 
-BROKEN = (
-    *(ValueError, TypeError, EOFError, OSError, MemoryError, SyntaxError, RuntimeError),
-    *(tokenize.TokenError, zipfile.BadZipFile, zlib.error),
-)
-"""Errors that decoders raise for damaged, encrypted or contradictory files. NumPy parses headers as Python code."""
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 _LARGEST_ARCHIVE = 1 << 26
 """Largest uncompressed size of an ``.npz`` file of cameras, in bytes."""
@@ -165,20 +157,6 @@ def finite_numbers(where: object, array: object, shapes: tuple[tuple[int, ...], 
     return numbers
 
 
-def array_header(stream: io.BytesIO) -> tuple[tuple[int, ...], np.dtype[Any]]:
-    """Read the shape and type of the values from the header of an ``.npy`` stream.
-
-    Afterwards, the position of the stream is the start of the values.
-
-    Raises:
-        One of ``BROKEN``: the header is invalid.
-    """
-    version = np.lib.format.read_magic(stream)
-    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-    shape, _, dtype = read(stream)
-    return shape, dtype
-
-
 def _array(data: bytes, kinds: str) -> NDArray[Any]:
     """Decode the content of an ``.npy`` file.
 
@@ -194,7 +172,6 @@ def _array(data: bytes, kinds: str) -> NDArray[Any]:
     return np.asarray(np.load(stream, allow_pickle=False))
 
 
-_HDR_SIZE = re.compile(rb"[-+]Y (\d{1,9}) [-+]X (\d{1,9})\n")
 _EXR_MAGIC = b"\x76\x2f\x31\x01"
 
 
@@ -277,39 +254,7 @@ def read_exr(path: Path, *choices: Sequence[str]) -> NDArray[Any]:
     raise damaged(path, f"a complete OpenEXR file with channels {channels_text}", found)
 
 
-def hdr_size(data: bytes) -> tuple[int, int] | None:
-    """Return the width and height in the header of a Radiance file. Return None if it is invalid."""
-    # The size follows the first empty line.
-    size = _HDR_SIZE.match(data, data.find(b"\n\n", 0, 4096) + 2)
-    return None if size is None or not data.startswith(b"#?") else (int(size[2]), int(size[1]))
-
-
-def exr_size(path: Path) -> tuple[int, int]:
-    """Return the width and height of an OpenEXR file from its headers, without decoding pixels.
-
-    If the file has several parts, return the size of the last part.
-
-    Raises:
-        ValueError: a part has more pixels than a picture may have.
-        Exception: the file is damaged. The package raises several kinds of errors.
-        PolarguideError: the package OpenEXR is missing.
-    """
-    package = optional_import("OpenEXR", str(path))
-    with in_utf8(path) as name, package.File(str(name), header_only=True) as file:
-        windows = [part.header["dataWindow"] for part in file.parts]
-    sizes = [tuple(int(high) - int(low) + 1 for low, high in zip(*window, strict=True)) for window in windows]
-    width, height = max(sizes, key=math.prod)
-    if width * height > LARGEST_PIXELS:
-        raise ValueError(f"{width}x{height} pixels")
-    width, height = sizes[-1]
-    return width, height
-
-
-SUFFIXES = (".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp", ".pgm", ".ppm", ".webp", ".heic", ".heif")
-_LOSSY = (".jpg", ".jpeg", ".webp", ".heic", ".heif")
 TRANSFERS = ("linear", "srgb")
-# Bytes per pixel: four channels of 16 bits, and as much for the decoder.
-_DECODED = 16
 
 FULL_CODE = 65535
 """Code that represents the linear intensity 1."""
@@ -522,66 +467,6 @@ def _table(full: int, transfer: str) -> NDArray[np.uint16]:
     return np.rint(levels * FULL_CODE).astype(np.uint16)
 
 
-def decode_stored(path: Path, data: bytes) -> NDArray[Any]:
-    """Decode a picture without conversion: [H, W] or [H, W, C] in OpenCV's order of channels, of any type.
-
-    TIFF is decoded by tifffile, HEIC by pillow-heif, and other kinds by OpenCV after a check of their structure. Pillow
-    would reduce 16-bit color to 8 bits.
-
-    Raises:
-        PolarguideError: the file is damaged, truncated, of an unsupported kind, or its samples are not gray or RGB.
-    """
-    damage = find_damage(data)
-    size = None if damage is not None else declared_size(data)
-    if size is not None and size[0] * size[1] > LARGEST_PIXELS:
-        damage = f"one of {size[0]}x{size[1]} pixels, more than any camera has"
-    if damage is not None:
-        raise _unreadable(path, damage)
-    kind = picture_kind(data)
-    pixels = None
-    try:
-        if kind in TIFFS:
-            pixels = decode_tiff(data)
-        elif kind == "HEIF":
-            pixels = heif_pixels(path, data)
-        else:
-            pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    except PolarguideError:
-        raise
-    except UnreadableTiffError as error:
-        raise PolarguideError(
-            path,
-            expected="one ordinary gray or RGB picture in a TIFF file",
-            found=str(error),
-            remedy="Export one gray or RGB picture. If the file has four angles, save each in a file of its own, "
-            f"such as {path.stem}_0.tif and {path.stem}_45.tif; or use the raw mosaic.",
-        ) from None
-    except Exception:  # decoders raise many kinds of errors
-        pixels = None
-    if pixels is None:
-        _require_memory(path, size)
-        raise _unreadable(path, "one that cannot be decoded")
-    # The fourth byte of BMP is padding.
-    return np.asarray(pixels[..., :3] if kind == "BMP" and pixels.ndim == 3 else pixels)
-
-
-def _unreadable(path: Path, found: str) -> PolarguideError:
-    """Return the error for an unsupported file. ``found`` is a noun phrase that describes it."""
-    if "HEIC" in found or "AVIF" in found:
-        return PolarguideError(
-            path,
-            expected="a PNG, JPEG, WebP, BMP, PGM or TIFF file, or an ordinary HEIC file",
-            found=found,
-            remedy="Export it as 16-bit TIFF or JPEG of the highest quality; phones can store JPEG or raw files.",
-        )
-    return damaged(path, "a complete PNG, JPEG or TIFF file (or WebP, BMP, PGM, HEIC)", found)
-
-
-def is_lossy(path: Path) -> bool:
-    """Return True if the suffix is that of JPEG, WebP or HEIC. These lossy formats are sRGB by convention."""
-    return path.suffix.lower() in _LOSSY
-
-
 def _loses_detail(data: bytes) -> bool:
     """Return True if the content of a picture file has a lossy compression."""
     kind = picture_kind(data)
@@ -592,136 +477,3 @@ def _loses_detail(data: bytes) -> bool:
         with tifffile.TiffFile(io.BytesIO(data)) as tiff:
             return int(tiff.pages.first.compression) in JPEG_IN_TIFF
     return kind in ("JPEG", "HEIF")
-
-
-def stated_full_scale(path: Path, file: BinaryIO, samples: NDArray[Any]) -> int | None:
-    """Return the full scale that a picture file states. Return None if it is the largest value of the type.
-
-    PGM and PPM state it in the header. For TIFF it follows from the number of bits or from MaxSampleValue, and for PNG
-    from the number of significant bits (sBIT).
-
-    Args:
-        path: path of the file for messages.
-        file: the open file, or its bytes.
-        samples: stored values.
-
-    Raises:
-        PolarguideError: a sample exceeds the full scale.
-    """
-    head = file.read(HEAD)
-    colors = samples[..., :3] if samples.ndim == 3 else samples
-    if samples.dtype.kind != "u":
-        return None
-    kind = picture_kind(head)
-    if kind == "PNG":
-        return _full_of_significant(colors, significant_bits(head))
-    full = pnm_full_scale(head)
-    if full == np.iinfo(samples.dtype).max:
-        full = None
-    elif kind in TIFFS:
-        file.seek(0)
-        with tifffile.TiffFile(file) as tiff:
-            full = tiff_full_scale(tiff)
-    if full is not None and int(colors.max(initial=0)) > full:
-        raise PolarguideError(
-            path,
-            expected=f"values up to {full}, the largest according to its header",
-            found=f"{int(colors.max())}",
-            remedy="Write the file with the maximum of the camera's values (1023 of 10 bits, 4095 of 12).",
-        )
-    return full
-
-
-def _full_of_significant(samples: NDArray[Any], bits: int | None) -> int | None:
-    """Return the full scale of a PNG file with significant bits.
-
-    According to the standard, the significant bits are the high bits. Some programs of cameras store them as low bits
-    instead. The function detects this case if all samples are small and their low bits are used.
-    """
-    kind = np.iinfo(samples.dtype)
-    if bits is None or not 0 < bits < kind.bits:
-        return None
-    spare = kind.bits - bits
-    at_bottom = int(samples.max(initial=0)) < 1 << bits and bool((samples & ((1 << spare) - 1)).any())
-    return (1 << bits) - 1 if at_bottom else int(kind.max) >> spare << spare
-
-
-def may_use_fewer_bits(path: Path) -> bool:
-    """Return True for a 16-bit picture file that may have values of a sensor with fewer bits.
-
-    Cameras with 10 to 14 bits write 16-bit PNG and TIFF files, which usually do not state the number of bits.
-    """
-    if not path.is_file():  # opening a pipe would block
-        return False
-    with contextlib.suppress(Exception), open(path, "rb") as file:  # tifffile raises several kinds of errors
-        head = file.read(HEAD)
-        if picture_kind(head) == "PNG":
-            return head[24] == 16 and significant_bits(head) is None
-        if picture_kind(head) in TIFFS:
-            file.seek(0)
-            with tifffile.TiffFile(file) as tiff:
-                return tiff.pages.first.dtype == np.uint16 and tiff_full_scale(tiff) is None
-    return False
-
-
-def _require_memory(path: Path, size: tuple[int, int] | None) -> None:
-    """Check that there is enough memory to decode a picture. Decoders report a lack of memory like damage.
-
-    Raises:
-        PolarguideError: there is too little memory for a picture of this size and its decoder.
-    """
-    width, height = size or (0, 0)
-    try:
-        np.empty(_DECODED * width * height, np.uint8)
-    except MemoryError:
-        raise PolarguideError(
-            path,
-            expected=f"memory for a picture of {width}x{height} pixels",
-            found="less",
-            remedy="Free memory, or check this shell's limits (ulimit -a).",
-        ) from None
-
-
-HEAD = 1 << 20
-LARGEST_PIXEL = 32
-"""Largest number of bytes per pixel in a file. Four channels of 64 bits take as many without compression."""
-ROOM = 1 << 26
-"""Largest size of a picture file's metadata in bytes, such as previews and profiles."""
-
-
-def stated_size(path: Path) -> tuple[int, int] | None:
-    """Return the width and height in the header of a picture or an array. Return None if they cannot be read.
-
-    Supported are PNG, JPEG, WebP, HEIC, BMP, PGM, TIFF, Radiance HDR, OpenEXR and ``.npy``.
-    """
-    if not path.is_file():  # reported when the file is read
-        return None
-    with contextlib.suppress(*BROKEN), open(path, "rb") as file:
-        suffix = path.suffix.lower()
-        if suffix == ".exr":
-            return exr_size(path)
-        kind = picture_kind(file.read(16))
-        file.seek(0)
-        if kind in TIFFS:
-            return tiff_size(file)
-        head = file.read(LARGEST_FILE if kind in ("WebP", "HEIF") else HEAD)
-        return {".hdr": hdr_size, ".npy": _array_size}.get(suffix, declared_size)(head)
-    return None
-
-
-def read_picture(path: Path) -> bytes:
-    """Read the content of a picture file. A file that is far too large for its number of pixels is refused.
-
-    Raises:
-        PolarguideError: the file is too large or cannot be read.
-    """
-    size = stated_size(path)
-    return read_file(
-        path, largest=ROOM if size is None else min(LARGEST_FILE, ROOM + LARGEST_PIXEL * size[0] * size[1])
-    )
-
-
-def _array_size(head: bytes) -> tuple[int, int] | None:
-    """Return the width and height of an array in an ``.npy`` file. The first axis of the array has the rows."""
-    shape, _ = array_header(io.BytesIO(head))
-    return (int(shape[1]), int(shape[0])) if len(shape) > 1 else None

@@ -137,8 +137,8 @@ def spoiled(bad: Mask, pattern: Pattern, *, mode: str, registered: bool = True) 
         for row, column in np.ndindex(2, 2):
             colored[row::2, column::2] = _spoiled_colors(bad, pattern, (row, column))
         # The 3x3 pixels around a pixel have all angles that it uses.
-        full = _dilated(colored, 1)
-        bad = full if mode == "full" else colored | full if registered else colored
+        all_angles = mode == "full" or registered
+        bad = cv2.dilate(colored.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0 if all_angles else colored
     return np.asarray(bad.reshape(bad.shape[0] // step, step, bad.shape[1] // step, step).any(axis=(1, 3)))
 
 
@@ -217,13 +217,6 @@ def _superpixels(values: Array, pattern: Pattern) -> Array:
                 [blocks[:, row, :, column] for row, column in np.argwhere(chosen)], axis=0, dtype=np.float32
             )
     return picture
-
-
-def _dilated(mask: Mask, radius: int) -> Mask:
-    if not mask.any():
-        return mask
-    kernel = np.ones((2 * radius + 1, 2 * radius + 1), np.uint8)
-    return np.asarray(cv2.dilate(mask.astype(np.uint8), kernel) > 0)
 
 
 _BEYOND_NOISE = 6.0
@@ -305,9 +298,10 @@ def _noise(rise: NDArray[np.float32], middle: NDArray[np.float32]) -> NDArray[np
     number = np.clip(np.searchsorted(edges, level, side="right") - 1, 0, max(0, len(edges) - 2))
     bins = max(1, len(edges) - 1)
     sorted_deviation = deviation[np.argsort(number.astype(np.uint8), kind="stable")]  # by bin
-    ends = np.cumsum(np.bincount(number, minlength=bins))
-    medians = [float(np.median(each)) for each in np.split(sorted_deviation, ends[:-1])]
-    place = np.clip(np.searchsorted(edges, middle, side="right") - 1, 0, len(medians) - 1)
+    counts = np.bincount(number, minlength=bins)
+    filled = counts > 0  # without the others, samples between two bins get the noise of the lower one
+    medians = [float(np.median(each)) for each in np.split(sorted_deviation, np.cumsum(counts[filled])[:-1])]
+    place = np.clip(np.searchsorted(edges[:bins][filled], middle, side="right") - 1, 0, None)
     # Rounding to whole numbers causes noise of a third of a step.
     return np.maximum(1.4826 * np.asarray(medians, np.float32), 1 / 3)[place]
 

@@ -102,7 +102,7 @@ def any_case(*names: str) -> PrimitiveConstructorSpec[Any]:
 SensorName = Annotated[Sensor, any_case(*SENSORS)]
 
 Packing = Literal["8", "16", "16be", "10p", "10packed", "10mipi", "12p", "12packed", "12mipi"]
-"""Name of the layout of pixel values in ``.raw`` files, see ``sensor.raw_file.PACKINGS``."""
+"""Name of the layout of pixel values in ``.raw`` files, see ``sensor.mosaics.PACKINGS``."""
 
 
 NotNegative = Annotated[int, Meta(ge=0, le=1 << 20)]

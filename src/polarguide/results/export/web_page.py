@@ -26,10 +26,9 @@ from polarguide.core.progress import SILENT, Reporter
 from polarguide.gaussians.gaussians import Parameters
 from polarguide.gaussians.geometry import shortest_axis_normals
 from polarguide.geometry.camera import Camera
-from polarguide.geometry.scene_frame import scene_frame
-from polarguide.geometry.trajectory import camera_record
+from polarguide.geometry.scene_frame import camera_record, scene_frame
 from polarguide.raster.interface import MINIMUM_ALPHA
-from polarguide.results.evaluation.record import METRICS_FILE, read_metrics
+from polarguide.results.evaluation.evaluate import METRICS_FILE, read_metrics
 from polarguide.results.evaluation.table import shown_metrics
 from polarguide.results.export.adapters import PageShading, page_shading
 from polarguide.results.export.placement import Presented

@@ -1,31 +1,36 @@
-"""Pictures of a run's layers next to the ground truth, and of a scene's polarization and priors."""
+"""Pictures of a run's layers next to the ground truth, and along a camera path.
+
+A rendering along a path becomes a video (MP4, H.264) or PNG files.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import contextlib
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from polarguide import optics
 from polarguide.capture import Scene, View
-from polarguide.capture.layout import refuse_scene
-from polarguide.core.errors import PolarguideError
+from polarguide.capture.layout import refuse_scene, require_memory
+from polarguide.core.errors import PolarguideError, optional_import
 from polarguide.core.files import atomic, make_folder, require_inside, write_whole
-from polarguide.core.options import PathLike, PictureFormat, check_choice, check_finite, index_of
+from polarguide.core.options import PathLike, PictureFormat, check_choice, check_finite
 from polarguide.core.progress import SILENT, Reporter
 from polarguide.core.records import to_json
 from polarguide.geometry.camera import Camera
+from polarguide.geometry.scene_frame import interpolated, orbit, read_path
 from polarguide.optics import luminance
+from polarguide.results.rendering.mesh import part_shown, subject_of
 from polarguide.results.rendering.relight import write_exr
 from polarguide.runs.model import Within
 from polarguide.runs.opened import OpenedRun, checked_layers
 from polarguide.shading.result import POLARIZED, RenderResult
-from polarguide.training.priors import facing_chromatic, guide_normals
-from polarguide.training.recipe import Priors
 from polarguide.visualization import figures
 from polarguide.visualization.figures import (
     Depths,
@@ -235,114 +240,212 @@ def _write_numbers(path: Path, values: Tensor) -> None:
         np.save(file, numbers.numpy())
 
 
-def write_priors(
-    scene: Scene,
-    out: PathLike,
-    *,
-    run: OpenedRun | None = None,
-    views: str = "test",
-    refractive_index: float | None = None,
-    threshold: float = 0.05,
-    reporter: Reporter = SILENT,
-) -> Path:
-    """Write PNG files that show the polarization of a scene, and a contact sheet of all of them.
+def write_video(path: Path, pictures: Iterable[Picture], *, frames_per_second: float) -> int:
+    """Write uint8 RGB pictures [H, W, 3] of one size as a video.
 
-    The pictures show S0, DoLP, AoLP, zenith, both separations, polarization normals, normals from color
-    differences, and the mask of usable pixels. The exact separation needs normals. They come from a trained run or,
-    without a run, from polarization. In the second case, only the visibility of the surface resolves the ambiguity of
-    the normals.
-
-    Args:
-        scene: a scene with poses.
-        out: folder to write.
-        run: a run trained on this scene at this size, whose normals resolve the ambiguity.
-        views: ``test``, ``train``, ``all``, or names separated by commas.
-        refractive_index: refractive index of the surfaces; None takes the index of the scene.
-        threshold: DoLP above which a pixel's normal is used.
-        reporter: receives the progress.
+    H.264 needs an even width and height. So the last column of an odd width and the last row of an odd height are cut
+    off.
 
     Returns:
-        The path of the contact sheet.
+        The number of written pictures.
 
     Raises:
-        PolarguideError: a view does not exist, the pictures of a view do not determine its polarization, or the run was
-            trained at another picture size.
+        PolarguideError: imageio-ffmpeg is not installed, or the encoder fails.
     """
-    check_finite("threshold", threshold, 0.0, 1.0)
-    index = index_of(refractive_index, scene.refractive_index)
-    check_finite("refractive_index", index, 1.0001, 4.0)
-    if run is not None and run.configuration.downscale != scene.downscale:
+    encoder = optional_import("imageio_ffmpeg", "--video")
+    count = 0
+    # The encoder chooses the format by the name's suffix.
+    with atomic(path) as temporary:
+        named = temporary.with_name(temporary.name + ".mp4")
+        writer = None
+        try:
+            for picture in pictures:
+                height, width = (side - side % 2 for side in picture.shape[:2])
+                if writer is None:
+                    writer = encoder.write_frames(
+                        str(named),
+                        (width, height),
+                        fps=frames_per_second,
+                        codec="libx264",
+                        macro_block_size=2,
+                        output_params=["-crf", "18", "-movflags", "+faststart"],
+                    )
+                    writer.send(None)
+                writer.send(np.ascontiguousarray(picture[:height, :width]))
+                count += 1
+            if writer is not None:
+                writer.close()
+                _require_complete(encoder, named, count)
+            named.replace(temporary)
+        except (OSError, RuntimeError) as error:
+            raise PolarguideError(
+                path,
+                expected="a video file",
+                found=(str(error).strip() or "a failure").splitlines()[-1][:200],
+                remedy="Free space on the disk, choose another folder, or reduce the layers.",
+            ) from None
+        finally:
+            if writer is not None:
+                with contextlib.suppress(OSError, RuntimeError):
+                    writer.close()  # Otherwise the encoder would continue to write the unlinked file.
+            named.unlink(missing_ok=True)
+    return count
+
+
+def _require_complete(encoder: Any, path: Path, count: int) -> None:
+    """Check the number of frames of a written video, because the encoder does not report a full disk.
+
+    Raises:
+        OSError: the file has fewer frames than were written.
+    """
+    try:
+        frames, _ = encoder.count_frames_and_secs(path)
+    except RuntimeError:  # the file cannot be read
+        frames = 0
+    if frames != count:
+        raise OSError(f"a file with {frames} of {count} pictures; the disk may be full")
+
+
+SWINGS = {"orbit": 0.0, "spiral": 0.25}
+"""Vertical amplitude of each path around the scene, as a share of the cameras' distance from its center."""
+FILLED = 0.9
+"""Share of the subject's Gaussians that every picture of a turntable contains. The outermost ones may be cut off."""
+FRAMES_PER_SECOND = 30.0
+RENDERED = 160
+"""Lower bound of the memory of a rendering, in bytes per pixel."""
+
+
+def path_cameras(
+    run: OpenedRun, path: str, frames: int, size: tuple[int, int] | None = None
+) -> tuple[list[Camera], float]:
+    """Return the cameras of a path, and their frames per second.
+
+    Args:
+        run: the run whose cameras define the path.
+        path: ``orbit``, ``turntable`` (around the subject, which fills the picture), ``spiral``,
+            ``interpolate``, or a JSON file of cameras.
+        frames: number of cameras; ignored for a file of cameras.
+        size: width and height of the pictures. None takes the size of the photographs. A file of cameras has its own
+            size.
+
+    Raises:
+        PolarguideError: there are too many frames, a size is specified together with a file, or the file cannot be
+            read.
+    """
+    check_finite("frames", frames, 1, 100_000)
+    cameras = list(run.cameras.values())
+    if size is not None:
+        cameras = [camera.extended(*size) for camera in cameras]
+    if path == "turntable":
+        return _turntable(run, cameras, frames), FRAMES_PER_SECOND
+    if path == "interpolate":
+        return interpolated(cameras, frames), FRAMES_PER_SECOND
+    if path in SWINGS:
+        return orbit(cameras, frames, swing=SWINGS[path], around=run.frame), FRAMES_PER_SECOND
+    if size is not None:
         raise PolarguideError(
-            "downscale",
-            expected=f"{run.configuration.downscale}, the factor of {run.folder}",
-            found=str(scene.downscale),
-            remedy="Use the same factor.",
+            "size",
+            expected="a path without its own picture sizes",
+            found=f"the file {path}",
+            remedy="Set the width and height of its cameras.",
         )
-    chosen = views_named(scene, views)
-    for view in chosen:
-        if not view.is_determined:
-            raise view.undetermined("polarization at every pixel")
-    make_folder(out := Path(out))
-    rows: list[dict[str, Picture]] = []
-    with reporter.track("drawing", len(chosen)) as advance:
-        for number, view in enumerate(chosen):
-            pictures = prior_pictures(view, run, index, threshold)
-            for name, picture in pictures.items():
-                figures.write_png(out / f"{view.name}_{name}.png", picture)
-            rows = [*rows, pictures][:SHEET_VIEWS]
-            advance(number + 1)
-    sheet = out / CONTACT_SHEET
-    labels = [view.name for view in chosen[:SHEET_VIEWS]]
-    figures.write_png(sheet, contact_sheet([[*row.values()] for row in rows], labels, [*rows[0]]))
-    return sheet
+    return read_path(Path(path))
 
 
-@torch.no_grad()
-def prior_pictures(view: View, run: OpenedRun | None, index: float, threshold: float) -> dict[str, Picture]:
-    """Return all polarization pictures of one view by file name."""
-    rays = view.camera.rays()
-    stokes = view.stokes()
-    luminance = optics.luminance(stokes)
-    dolp = optics.dolp(luminance)
-    aolp = optics.aolp(luminance)
-    zenith = optics.diffuse_zenith(dolp, index)
-    guide, source = resolving_normals(view, run, rays, luminance, index)
-    mask = optics.polarization_mask(
-        luminance, threshold=threshold, invalid=view.invalid, saturated=view.saturated
+def _turntable(run: OpenedRun, cameras: list[Camera], frames: int) -> list[Camera]:
+    means = run.model.state.gaussians["means"].detach()
+    inner = means[subject_of(run).holds(means)].cpu().double()
+    center = inner.median(dim=0).values
+    radius = float((inner - center).norm(dim=1).quantile(FILLED))
+    lens = cameras[0]
+    return orbit(
+        cameras,
+        frames,
+        around=replace(run.frame, center=center),
+        distance=radius / math.sin(math.atan(min(lens.width / lens.fx, lens.height / lens.fy) / 2)),
     )
-    candidates = optics.physical_candidates(luminance, rays, index)
-    normal = optics.disambiguate(candidates, guide, rays, azimuth_weight=0.5).normal
-    good = ~(view.invalid | view.saturated)
-    chromatic, certain = facing_chromatic(stokes, guide, rays, index, good, Priors())
-    paper = optics.paper_separation(stokes, zenith, index)
-    exact = optics.exact_separation(stokes, guide, rays, index)
-    degrees = torch.rad2deg(zenith)
-    return {
-        "S0": figures.radiance_to_rgb(view.photograph()),
-        "DoLP": figures.dolp_to_rgb(dolp),
-        "AoLP": figures.aolp_to_rgb(aolp, dolp),
-        "zenith_diffuse": figures.scalar_to_rgb(degrees, 0.0, 90.0),
-        "specular_paper": figures.radiance_to_rgb(paper.specular / 2),
-        "diffuse_paper": figures.radiance_to_rgb(paper.diffuse / 2),
-        f"specular_exact_{source}": figures.radiance_to_rgb(exact.specular / 2),
-        f"diffuse_exact_{source}": figures.radiance_to_rgb(exact.diffuse / 2),
-        f"normal_{source}": figures.normal_to_rgb(
-            view.camera.to_world(normal * mask[..., None]), view.camera
-        ),
-        "normal_by_color": figures.normal_to_rgb(
-            view.camera.to_world(chromatic * (certain[..., None] > 0)), view.camera
-        ),
-        "mask": figures.scalar_to_rgb(mask.float(), 0.0, 1.0),
-    }
 
 
-def resolving_normals(
-    view: View, run: OpenedRun | None, rays: Tensor, luminance: Tensor, index: float
-) -> tuple[Tensor, str]:
-    """Return camera-space normals that resolve the ambiguity of polarization normals, and the name of their source."""
-    if run is not None:
-        normal = run.result(view.name, depth=False).to("cpu").normal
-        return guide_normals(view.camera.to_camera(normal), rays, Priors.minimum_normal)[0], "by_run"
-    guess = torch.nn.functional.normalize(torch.tensor([0.0, -0.5, -1.0]).expand_as(rays), dim=-1)
-    candidates = optics.physical_candidates(luminance, rays, index)
-    return optics.disambiguate(candidates, guess, rays, azimuth_weight=0.0).normal, "by_polarization"
+def write_film(
+    run: OpenedRun,
+    out: PathLike,
+    *,
+    path: str = "orbit",
+    layers: Sequence[str] = ("final",),
+    frames: int = 120,
+    size: tuple[int, int] | None = None,
+    reporter: Reporter = SILENT,
+) -> None:
+    """Render layers of the subject side by side along a path. A video of several layers shows their names.
+
+    Args:
+        run: the run; its scene is read.
+        out: MP4 file to write, or a folder for PNG files.
+        path, frames: see ``path_cameras``.
+        size: width and height of the film with all layers; None shows each layer in the size of the photographs.
+        layers: names of layers.
+        reporter: receives the progress.
+
+    Raises:
+        PolarguideError: a layer does not exist, the cameras have several sizes, or the video cannot be encoded.
+    """
+    out = Path(out)
+    names = checked_layers(list(layers))
+    refuse_scene(out if out.suffix.lower() != ".mp4" else out.parent)
+    if out.parent == run.folder:  # The run may come from another user.
+        require_inside(run.folder, out)
+    tile = None if size is None else (size[0] // len(names), size[1])
+    cameras, speed = path_cameras(run, path, frames, tile)
+    sizes = sorted({(camera.width, camera.height) for camera in cameras})
+    if len(sizes) > 1:
+        raise PolarguideError(
+            "path",
+            expected="cameras of one size",
+            found=", ".join(f"{width}x{height}" for width, height in sizes[:4]),
+            remedy="Set the same width and height for all cameras.",
+        )
+    width, height = sizes[0]
+    require_memory(
+        Path(path),
+        RENDERED * width * height,
+        f"pictures of {width}x{height}",
+        remedy="Reduce the width and height of the cameras of the path.",
+    )
+    pictures = _pictures(run, names, cameras, reporter, named=out.suffix.lower() == ".mp4" and len(names) > 1)
+    if size is not None:  # The remainder of the width is black.
+        rest = size[0] % len(names)
+        pictures = (np.pad(picture, ((0, 0), (0, rest), (0, 0))) for picture in pictures)
+    if out.suffix.lower() == ".mp4":
+        make_folder(out.parent)
+        count = write_video(out, pictures, frames_per_second=speed)
+        reporter.say(f"video: {out} ({count} pictures, {count / speed:.1f} s)")
+        return
+    make_folder(out)
+    about = {"Polarization": run.polarization}
+    for number, picture in enumerate(pictures):
+        figures.write_png(out / f"path_{number:05d}.png", picture, about=about)
+    reporter.say(f"pictures: {out}/path_*.png")
+
+
+def _pictures(
+    run: OpenedRun, layers: list[str], cameras: list[Camera], reporter: Reporter, *, named: bool
+) -> Iterator[Picture]:
+    """Yield one picture per camera, which shows the layers side by side; ``named`` adds their names."""
+    within = part_shown(run, reporter)
+    depths = rendered_depths(run, cameras, within) if "depth" in layers else None
+    color = run.presentation.color
+    surface = bool({"normal", "depth"} & {*layers})
+    polarized = not {*layers}.isdisjoint(POLARIZED)
+    with reporter.track("rendering", len(cameras)) as advance:
+        for number, camera in enumerate(cameras):
+            result = run.result(
+                camera, depth="depth" in layers, surface=surface, polarized=polarized, within=within
+            )
+            run.chosen_layers(result, layers)
+            tiles = []
+            for name in layers:
+                picture = layer_picture(result, name, camera, depths, color=color)
+                assert picture is not None
+                tiles.append(figures.with_name(picture, name) if named else picture)
+            advance(number + 1)
+            yield np.concatenate(tiles, axis=1)

@@ -48,13 +48,13 @@ from polarguide.core.system import UNBOUNDED, MemoryBound
 from polarguide.gaussians.gaussians import Gaussians
 from polarguide.gaussians.geometry import shortest_axis_normals
 from polarguide.gaussians.initialize import far_away
-from polarguide.geometry.vectors import dot
+from polarguide.geometry.camera import dot
 from polarguide.optics.fresnel import reflectances_from_cosine
 from polarguide.raster import Rasterize
 from polarguide.shading.gbuffer import render
 from polarguide.shading.metal import FIRST_REFLECTANCE, become_metal
 from polarguide.shading.model import Light, Parameters, ShadingModel, radiance_cubemap
-from polarguide.training.context import TrainingContext
+from polarguide.training.context import TrainingContext, TrainingState
 from polarguide.training.metals.observations import (
     LEAST_PIXELS,
     ViewSamples,
@@ -67,7 +67,6 @@ from polarguide.training.metals.observations import (
 )
 from polarguide.training.recipe import MetalRules, MetalViews, Recipe, Schedule
 from polarguide.training.settings import ResolvedSettings
-from polarguide.training.state import TrainingState
 
 ROUGH = (1.0, 0.85, 0.7, 0.55)
 """Tested shares of the specular polarization that remain on a rough dielectric."""

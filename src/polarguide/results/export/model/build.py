@@ -15,15 +15,22 @@ from polarguide.core.errors import PolarguideError, require_package
 from polarguide.core.options import BaseColor, ModelOptions
 from polarguide.core.progress import Reporter
 from polarguide.core.system import free_memory
-from polarguide.results.export.model.bake import Baked, ColorSource, bake
+from polarguide.results.export.model.bake import (
+    WHAT,
+    Baked,
+    ColorSource,
+    Surroundings,
+    arriving_light,
+    bake,
+    delit,
+    irradiance,
+)
 from polarguide.results.export.model.gltf import Textured, color_pixels, linear_pixels
-from polarguide.results.export.model.irradiance import WHAT, Surroundings, arriving_light, delit, irradiance
 from polarguide.results.export.model.topology import SurfaceView, subject_surface
 from polarguide.results.export.model.unwrap import Texels, Unwrapped, rasterized_texels, unwrap
 from polarguide.results.export.placement import Placement
-from polarguide.results.rendering.mesh import ColoredMesh, Surface, fused_surface, painted
+from polarguide.results.rendering.mesh import ColoredMesh, Inside, Surface, fused_surface, painted
 from polarguide.results.rendering.relight import mirrored_light, needs_radiance
-from polarguide.results.rendering.subject import Inside
 from polarguide.runs.opened import OpenedRun
 from polarguide.shading.cubemap import cubemap_lookup
 from polarguide.shading.deferred import DeferredShading

@@ -20,13 +20,13 @@ from polarguide.results.rendering.mesh import (
     Box,
     ColoredMesh,
     DepthSamples,
+    Inside,
     NoSurfaceError,
     Surface,
     face_pieces,
     fused_surface,
     largest_pieces,
 )
-from polarguide.results.rendering.subject import Inside
 from polarguide.runs.opened import OpenedRun
 from polarguide.shading.result import RenderResult
 

@@ -1,0 +1,148 @@
+"""Train and score all methods on all scenes of the final measurement, part by part.
+
+    python benchmarks/final/measure.py SCENES OUT [--parts four bench ...] [--jobs 1] [--threads 1]
+
+Each JSON file in this folder is a part: scenes, recipes with their numbers of seeds, and settings. SCENES contains the
+scene folders, in a subfolder if the part names one. SCENES/heldout is the output of benchmarks/heldout/render.py, and
+SCENES/bench is the folder scenes of polarguide bench --render-only.
+
+Each part is a comparison in OUT/PART. Its record is copied to benchmarks/results/final/PART.json after the part, and
+after Ctrl-C. The same command resumes; finished runs are not repeated. To add seeds, change the number in the part and
+repeat the command. The tables are printed by
+
+    python benchmarks/accuracy/bench_tables.py benchmarks/results/final/PART.json
+
+Times and speeds are measured only with --jobs 1 on a machine without other work.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+import shutil
+import sys
+from pathlib import Path
+
+import msgspec
+
+import polarguide
+from polarguide.core.errors import PolarguideError
+from polarguide.core.files import make_folder
+from polarguide.core.progress import Reporter
+from polarguide.core.records import read_record
+from polarguide.training.settings import TrainSettings
+from polarguide_bench.options import CompareOptions
+from polarguide_bench.recipes import recipe_named
+
+HERE = Path(__file__).resolve().parent
+RECORDS = HERE.parent / "results" / "final"
+PARTS = ("heldout", "four", "bench", "real", "publication", "gnerp", "ablations")
+"""Parts in the order of the measurement."""
+
+
+class MessageReporter(Reporter):
+    """Reporter that prints messages without progress."""
+
+    def say(self, text: str) -> None:
+        """Print a message."""
+        print(text, flush=True)
+
+    def warn(self, text: str) -> None:
+        """Print a warning."""
+        print(f"warning: {text}", flush=True)
+
+
+class Part(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Part of the final measurement.
+
+    Attributes:
+        about: description.
+        scenes: names of the scene folders.
+        steps: steps of each training.
+        recipes: number of seeds of each recipe, in the order of the tables.
+        folder: subfolder of the scenes.
+        downscale: factor by which pictures are reduced.
+        refractive_index: refractive index of all scenes, or None if each scene has its own.
+        against: reference recipe of the differences, or None without differences.
+    """
+
+    about: str
+    scenes: list[str]
+    steps: int
+    recipes: dict[str, int]
+    folder: str = ""
+    downscale: int = 1
+    refractive_index: float | None = None
+    against: str | None = None
+
+
+def read_part(path: Path) -> Part:
+    """Read a part, and check the names of its recipes.
+
+    Raises:
+        PolarguideError: the file is invalid, or a recipe is unknown.
+    """
+    part = read_record(path, Part, remedy="Name a part of benchmarks/final, or a valid JSON file.")
+    for name in part.recipes:
+        recipe_named(name)
+    return part
+
+
+def measure(part: Part, scenes: Path, out: Path, *, jobs: int, threads: int) -> None:
+    """Train and score the runs of a part that are not finished.
+
+    Raises:
+        PolarguideError: a scene is missing, or the comparison fails.
+    """
+    polarguide.compare(
+        [scenes / part.folder / name for name in part.scenes],
+        list(part.recipes),
+        out,
+        settings=TrainSettings(steps=part.steps, refractive_index=part.refractive_index),
+        options=CompareOptions(
+            jobs=jobs,
+            threads=threads,
+            seeds=max(part.recipes.values()),
+            speed=jobs == 1,
+            downscale=part.downscale,
+            against=part.against,
+        ),
+        seeds_of=part.recipes,
+        command_line=shlex.join(["python", *sys.argv]),
+        reporter=MessageReporter(),
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("scenes", type=Path)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--parts", nargs="+", default=PARTS, help="names of parts, or JSON files")
+    parser.add_argument("--records", type=Path, default=RECORDS)
+    parser.add_argument("--jobs", type=int, default=1)
+    parser.add_argument("--threads", type=int, default=1)
+    options = parser.parse_args()
+    try:
+        parts = {
+            Path(name).stem: read_part(HERE / f"{name}.json" if name in PARTS else Path(name))
+            for name in options.parts
+        }
+        make_folder(options.records)
+        for name, part in parts.items():
+            print(f"{name}: {part.about}", flush=True)
+            out = options.out / name
+            try:
+                measure(part, options.scenes, out, jobs=options.jobs, threads=options.threads)
+            finally:
+                if (out / "results.json").exists():
+                    shutil.copyfile(out / "results.json", options.records / f"{name}.json")
+    except PolarguideError as error:
+        parser.error(str(error))
+    except KeyboardInterrupt:
+        sys.exit("Stopped. The same command resumes.")
+
+
+if __name__ == "__main__":
+    main()

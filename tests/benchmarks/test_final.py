@@ -1,0 +1,115 @@
+"""Lists of the final measurement, and the scene files of the held-back half."""
+
+import json
+import shutil
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from polarguide.capture import load_scene
+from polarguide.capture.layout import find_layout
+from polarguide.core.errors import PolarguideError
+from polarguide_bench.options import BENCH
+from polarguide_synth.colmap import place_cameras
+from polarguide_synth.settings import find_scene
+
+BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
+sys.path += [str(BENCHMARKS / name) for name in ("accuracy", "final", "heldout")]
+import measure  # noqa: E402
+import render  # noqa: E402
+from simulated_mosaics import FULL, linear_intensities, mosaic  # noqa: E402
+
+
+@pytest.mark.parametrize("name", measure.PARTS)
+def test_a_part_compares_known_recipes(name: str) -> None:
+    part = measure.read_part(measure.HERE / f"{name}.json")
+    assert part.against in (None, *part.recipes)
+    assert min(part.recipes.values()) >= 1
+    assert len(set(part.scenes)) == len(part.scenes)
+
+
+def test_parts_contain_all_scenes() -> None:
+    bench, heldout = (measure.read_part(measure.HERE / f"{name}.json") for name in ("bench", "heldout"))
+    assert set(bench.scenes) == {*BENCH.development, *BENCH.held_back}
+    assert (bench.steps, bench.refractive_index) == (BENCH.training.steps, BENCH.training.refractive_index)
+    assert tuple(heldout.scenes) == render.SCENES == tuple(path.stem for path in scene_files())
+
+
+def scene_files() -> list[Path]:
+    """Scene files in the order of ``render.SCENES``. Unlisted files are last."""
+    order = {name: number for number, name in enumerate(render.SCENES)}
+    files = [path for path in render.HERE.glob("*.json") if path != render.CHECKSUMS]
+    return sorted(files, key=lambda path: order.get(path.stem, len(order)))
+
+
+@pytest.mark.parametrize(
+    ("text", "fault"),
+    [
+        ('{"about": "a", "scenes": ["a"], "steps": 9, "recipes": {"3dsg": 1}}', "3dsg"),
+        ('{"about": "a", "scenes": ["a"], "steps": 9, "recipes": {"3dgs": "one"}}', "recipes"),
+        ('{"about": "a", "scenes": ["a"], "steps": 9, "recipes": {"3dgs": 1}, "seed": 3}', "seed"),
+        ('{"about": "a", "scenes": ["a"], "recipes": {"3dgs": 1}}', "steps"),
+    ],
+)
+def test_a_wrong_part_is_refused(text: str, fault: str, tmp_path: Path) -> None:
+    (tmp_path / "part.json").write_text(text)
+    with pytest.raises(PolarguideError, match=fault):
+        measure.read_part(tmp_path / "part.json")
+
+
+@pytest.mark.parametrize("name", render.SCENES)
+def test_a_held_back_scene_has_its_views(name: str) -> None:
+    scene = find_scene(str(render.HERE / f"{name}.json"))
+    assert scene.name == name
+    assert (scene.camera.views, len(range(0, scene.camera.views, render.SYNTH.test_every))) == (48, 8)
+    metals = {thing.name for thing in scene.things if thing.material.type == "metal"}
+    assert bool(metals) == (name in ("valve", "trophy"))
+    assert scene.object_only == (name == "tortoise")
+
+
+def test_all_cameras_are_inside_the_small_room() -> None:
+    scene = find_scene(str(render.HERE / "bathroom.json"))
+    cameras = place_cameras(scene.camera, render.SYNTH.width, render.SYNTH.height, render.SYNTH.seed)
+    centers = np.stack([camera.center.numpy() for camera in cameras])
+    assert np.abs(centers[:, :2]).max() < 1.5
+    assert 0.7 < centers[:, 2].min() < centers[:, 2].max() < 2.3
+
+
+@pytest.fixture
+def rendering(demo_scene: Path, tmp_path: Path) -> Path:
+    """The demo scene as ``synth`` would write it with a sensor."""
+    folder = tmp_path / "rendering"
+    for name in ("gt", "sparse"):
+        shutil.copytree(demo_scene / name, folder / name)
+    for name in ("split.json", "scene.json"):
+        shutil.copyfile(demo_scene / name, folder / name)
+    (folder / "calibration.json").write_text(
+        json.dumps({"gains": dict.fromkeys(("0", "45", "90", "135"), 1.0)})
+    )
+    (folder / "raw").mkdir()
+    layout = find_layout(demo_scene)
+    for view in layout.names:
+        light = mosaic(linear_intensities(layout, view, "linear"), electrons=0, rng=np.random.default_rng(0))
+        values = np.rint(64 + light.astype(float) * (4095 - 64) / FULL).astype(np.uint16)
+        assert cv2.imwrite(str(folder / "raw" / f"{view}.png"), values)
+    return folder
+
+
+def test_a_prepared_rendering_has_ground_truth(rendering: Path, demo_scene: Path, tmp_path: Path) -> None:
+    out = tmp_path / "scene"
+    for _ in range(2):  # the second call changes nothing
+        render.prepare_rendering(rendering, out)
+    prepared = load_scene(out)
+    demo = load_scene(demo_scene)
+    assert prepared.test_names == demo.test_names
+    assert prepared.objects == demo.objects
+    for name in demo.test_names:
+        view = prepared.view(name)
+        assert view.ground_truth is not None
+        valid = ~(view.invalid | view.saturated)
+        difference = view.photograph() - demo.view(name).photograph()
+        assert difference[valid].abs().median() < 0.01
+        assert view.ground_truth.normal is not None

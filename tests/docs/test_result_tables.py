@@ -1,0 +1,205 @@
+"""Tables of docs/results, computed again from the records in benchmarks/results."""
+
+import json
+import sys
+from pathlib import Path
+from statistics import fmean, stdev
+
+import pytest
+
+from polarguide_bench.join import LAYOUTS, measured_section
+from polarguide_bench.results import Results, read_results
+from polarguide_bench.tables import against_section
+
+ROOT = Path(__file__).resolve().parents[2]
+RECORDS = ROOT / "benchmarks" / "results"
+sys.path.append(str(ROOT / "benchmarks" / "accuracy"))
+import bench_tables  # noqa: E402
+import losses  # noqa: E402
+from bench_records import of_run, read_scenes, values  # noqa: E402
+
+DEVELOPMENT = ("figure", "kit", "car", "water", "metals-a", "ceramic-a")
+HELD_BACK = ("metals-b", "ceramic-b", "cup", "rough", "lacquer")
+FOUR = ("spheres", "cup", "car", "water")
+LAYERS = {"specular": "specular PSNR", "diffuse": "diffuse PSNR"}
+WITHOUT_METALS = {name: f"{heading} without metals" for name, heading in LAYERS.items()}
+OTHERS = losses.without_polarization(bench_tables.RECIPE)
+
+
+def scenes_of(folder, names):
+    return read_scenes([RECORDS / folder / f"{name}.json" for name in names])
+
+
+def tables_of(lines):
+    """Tables of a Markdown text: a list of rows each, with cells by heading."""
+    tables = []
+    header = None
+    for line in lines:
+        cells = [cell.strip() for cell in line.split("|")[1:-1]] if line[:1] == "|" else None
+        if cells is None:
+            header = None
+        elif header is None:
+            header = cells
+            tables.append([])
+        elif not line.startswith("|---"):
+            tables[-1].append(dict(zip(header, cells, strict=True)))
+    return tables
+
+
+def page_table(page, *headings):
+    """The table of a page whose first headings are these."""
+    lines = (ROOT / "docs" / "results" / f"{page}.md").read_text(encoding="utf-8").splitlines()
+    (table,) = [table for table in tables_of(lines) if tuple(table[0])[: len(headings)] == headings]
+    return table
+
+
+def printed(lines):
+    """Rows of a printed table by the first cell."""
+    (table,) = tables_of(list(lines))
+    return {next(iter(row.values())): row for row in table}
+
+
+def assert_equal_tables(stated, computed, names):
+    for row in stated:
+        (first, label), *cells = row.items()
+        expected = {heading: computed[label][names.get(heading, heading)] for heading, _ in cells}
+        assert {first: label, **expected} == row
+
+
+@pytest.mark.parametrize(
+    ("page", "headings", "folder", "scenes", "layers"),
+    [
+        ("index", ("recipe, eleven scenes",), "bench", (*DEVELOPMENT, *HELD_BACK), WITHOUT_METALS),
+        ("index", ("recipe, four scenes",), "four", FOUR, LAYERS),
+        ("index", ("recipe", "PSNR", "Stokes error"), "four", ("wwbottle",), {}),
+        ("bench-held-back", ("recipe", "PSNR"), "bench", HELD_BACK, LAYERS),
+        ("captures", ("angles of each view",), "", ("exposures",), LAYERS),
+    ],
+)
+def test_means_over_scenes(page, headings, folder, scenes, layers):
+    computed = printed(bench_tables.mean_table(scenes_of(folder, scenes)))
+    assert_equal_tables(page_table(page, *headings), computed, layers)
+
+
+def test_gains_by_scene():
+    computed = printed(bench_tables.control_table(scenes_of("bench", HELD_BACK)))
+    assert_equal_tables(page_table("bench-held-back", "scene", "PSNR"), computed, WITHOUT_METALS)
+
+
+def test_values_by_material():
+    (table,) = tables_of(bench_tables.material_table(scenes_of("bench", (*DEVELOPMENT, *HELD_BACK))))
+    stated = page_table("index", "material", "normal error (deg)")
+    assert [[*row.values()] for row in stated] == [[*row.values()] for row in table]
+
+
+def test_losses():
+    scenes = scenes_of("bench", (*HELD_BACK, *DEVELOPMENT))
+    lines = list(losses.loss_tables(scenes, bench_tables.RECIPE, OTHERS))
+    by_scene, by_method, _ = tables_of(lines)
+    page = page_table("bench-held-back", "scene", "losses by scene")
+    assert {tuple(row.values())[:3] for row in page} == {tuple(row.values()) for row in by_scene}
+    method = page_table("bench-held-back", "method", "losses")
+    assert [tuple(row.values()) for row in method] == [tuple(row.values()) for row in by_method]
+    text = " ".join((ROOT / "docs" / "results" / "bench-held-back.md").read_text(encoding="utf-8").split())
+    assert lines[0] in text
+
+
+def test_mean_gains():
+    halves = {"held back": HELD_BACK, "all eleven": (*DEVELOPMENT, *HELD_BACK)}
+    computed = {
+        half: printed(losses.gain_table(scenes_of("bench", names), bench_tables.RECIPE, OTHERS))
+        for half, names in halves.items()
+    }
+    name = ""
+    for row in page_table("bench-held-back", "`polarguide-stokes` compared with"):
+        _, half, *cells = row.values()
+        name = next(iter(row.values())).removeprefix("its control ") or name
+        label = name.replace("`:", "`polarguide-stokes:")
+        assert [*computed[half][label].values()][1:] == cells
+
+
+@pytest.mark.parametrize(
+    ("layout", "last"), [("publication-1", "polarguide-stokes"), ("publication-2", None)]
+)
+def test_tables_of_the_publication(layout, last):
+    section = measured_section(Results(read_results(RECORDS / "publication.json")), LAYOUTS[layout])
+    headings = ("scene", "metric", "GNeRP" if last else "3DGS-DR")
+    computed = [
+        [
+            scene,
+            labels[0][0],
+            *(" ".join(filter(None, (f"**{v}**" if bold else v, more))) for v, more, bold in cells),
+        ]
+        for scene, rows in section.blocks
+        for labels, cells in rows
+    ]
+    assert [[*row.values()] for row in page_table("publication", *headings)] == computed
+
+
+FIVE = ("psnr", "psnr_foreground", "normal_mae_deg", "specular_psnr", "diffuse_psnr")
+
+
+def test_five_values_of_the_publication():
+    scenes = read_scenes([RECORDS / "publication.json"])
+    for row in page_table("publication", "recipe", "`spheres`"):
+        recipe, *cells, mean = row.values()
+        computed = [
+            [fmean(values(scenes[scene.strip("`")][recipe.strip("`")], of_run(key)).values()) for key in FIVE]
+            for scene in [*row][1:-1]
+        ]
+        assert cells == [" / ".join(f"{value:.1f}" for value in of) for of in computed]
+        assert mean == " / ".join(f"{fmean(of):.1f}" for of in zip(*computed, strict=True))
+
+
+def test_polgs():
+    runs = json.loads((ROOT / "benchmarks" / "records" / "polgs.json").read_text(encoding="utf-8"))["runs"]
+    keys = {**dict.fromkeys(FIVE, 1), "stokes_error": 2, "depth_error_median_percent": 2}
+    means = {}
+    for row in page_table("index", "scene", "recipe"):
+        scene, recipe, *cells = (cell.strip("`") for cell in row.values())
+        numbers = [
+            [run[key] for name, run in runs.items() if name.startswith(f"{scene}/{recipe}/")] for key in keys
+        ]
+        if scene == "mean":
+            computed = [fmean(of) for of in zip(*means[recipe], strict=True)]
+            assert cells == [f"{value:.{n}f}" for value, n in zip(computed, keys.values(), strict=True)]
+        else:
+            means.setdefault(recipe, []).append([fmean(of) for of in numbers])
+            assert cells == [
+                f"{fmean(of):.{n}f} ± {stdev(of):.{n}f}" for of, n in zip(numbers, keys.values(), strict=True)
+            ]
+
+
+def test_normals_of_gnerp():
+    scenes = read_scenes([RECORDS / f"gnerp{name}.json" for name in ("", "-car", "-water", "-circular")])
+    (table,) = (
+        table
+        for table in tables_of(
+            (ROOT / "docs" / "reference" / "gnerp.md").read_text(encoding="utf-8").splitlines()
+        )
+        if tuple(table[0])[:2] == ("recipe", "`spheres`")
+    )
+    for row in table:
+        recipe = row.pop("recipe").strip("`")
+        for scene, cell in row.items():
+            rows = scenes[scene.strip("`")]
+            found = values(rows.get(recipe, {}), of_run("normal_mae_deg")).values()
+            assert cell == "".join(f"{value:.1f}°" for value in found)
+
+
+@pytest.mark.parametrize("recipe", ["polarguide-stokes", "polarguide"])
+def test_ablations(recipe):
+    results = Results(read_results(RECORDS / f"ablation-{recipe}.json"))
+    section = against_section(results)
+    _, rows = section.blocks[-1]
+    computed = {labels[0][0]: dict(zip(section.headings, cells, strict=True)) for labels, cells in rows}
+    metrics = ("PSNR", "PSNR foreground", "normal error", "specular PSNR", "diffuse PSNR")
+    lines = (ROOT / "docs" / "results" / "ablations.md").read_text(encoding="utf-8")
+    (table,) = tables_of(lines.partition(f"\n## `{recipe}`\n")[2].partition("\n## ")[0].splitlines())
+    for row in table[1:]:
+        label = row.pop("row").split(" (")[0].strip("`")
+        name = f"{recipe}{label}" if label.startswith(":") else label
+        cells = {
+            heading.split(" (")[0].split(" ↑")[0].split(" ↓")[0]: c for heading, c in computed[name].items()
+        }
+        assert [cells[metric][0] for metric in metrics] == list(row.values())
