@@ -23,6 +23,7 @@ from polarguide.core.progress import Reporter
 from polarguide_bench.join import LAYOUTS, measured_section, published_section
 from polarguide_bench.results import Results
 from polarguide_bench.tables import Section, readable
+from polarguide_bench.verbs import print_results
 
 RECIPES = ("3dgs", "3dgs-dr", "ref-gs", "polarguide-paper", "polarguide-paper:kind", "polarguide-stokes")
 """Recipes of the first table of PolarGuide-GSDR, without GNeRP, which trains for hours."""
@@ -211,6 +212,7 @@ def main() -> None:
     table = options.out / "published.md"
     write_text(table, readable(published_sections(results, options.dataset), "results.md"))
     reporter.say(f"table: {table}")
+    print_results(results, options.out / options.dataset)
 
 
 if __name__ == "__main__":

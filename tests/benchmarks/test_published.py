@@ -4,7 +4,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from comparison_records import results, run
+from comparison_records import results, run, unfinished
 from dataset_files import WRITERS
 from faults import Fault
 
@@ -80,6 +80,20 @@ def test_captures_without_published_scores_are_named() -> None:
     ]
     *_, last = published.published_sections(results(scored), "pandora")
     assert "PolarGuide-GSDR has no scores of owl." in last.notes
+
+
+def test_a_failed_run_ends_with_its_error_after_the_table(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    WRITERS["pandora"](tmp_path / "gnome")
+    scored = results([run("gnome", "3dgs", 0, psnr=20.0), unfinished("gnome", "3dgs-dr", 0, "no memory")])
+    monkeypatch.setattr(published.polarguide, "compare", lambda *_, **__: scored)
+    out = tmp_path / "out"
+    monkeypatch.setattr(sys, "argv", ["published.py", "pandora", str(tmp_path / "gnome"), "--out", str(out)])
+    Fault("pandora", "2 finished runs", "gnome, 3dgs-dr, seed 0: no memory", "repeat").raised_by(
+        published.main
+    )
+    assert "Gnome (indoor)" in (out / "published.md").read_text()
 
 
 @pytest.mark.slow
