@@ -39,7 +39,7 @@ SCENES = ("valve", "trophy", "pantry", "picnic", "bathroom", "tortoise")
 SYNTH = SynthSettings(size="128x96", samples=192, seed=80, sensor="IMX250MYR", noise=1.0, test_every=6)
 """Settings of the renderings. The size is that of the prepared pictures. The 48 views include 8 held-out views.
 
-A sample of a mosaic has a quarter of the paths. With fewer paths, their noise would exceed the noise of the sensor.
+A sample of a mosaic has a quarter of the paths. With fewer paths, their noise clearly exceeds the noise of the sensor.
 """
 
 
