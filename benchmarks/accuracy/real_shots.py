@@ -13,8 +13,9 @@ The shots are files of other projects, and some have no license, so they are not
 - ``pot``: two views of a metal pot with a white lid, in the layout of NeISF (sony/NeISFpp)
 - ``underwater``: twelve angles under a polarized lamp (MinjieWan, active polarization under water)
 
-The expected values were measured by hand on the same files, without this program. Their ranges contain rounding. The
-pictures of all maps are in ``OUT/maps``. Angles are in degrees, counter-clockwise as displayed.
+Most expected values were measured by hand on the same files, without this program. Their ranges contain rounding.
+``docs/reference/real-shots.md`` lists the others. The pictures of all maps are in ``OUT/maps``. Angles are in degrees,
+counter-clockwise as displayed.
 """
 
 from __future__ import annotations
