@@ -23,6 +23,7 @@ from polarguide.core.progress import Reporter
 from polarguide_bench.join import LAYOUTS, measured_section, published_section
 from polarguide_bench.results import Results
 from polarguide_bench.tables import Section, readable
+from polarguide_bench.verbs import print_results
 
 RECIPES = ("3dgs", "3dgs-dr", "ref-gs", "polarguide-paper", "polarguide-paper:kind", "polarguide-stokes")
 """Recipes of the first table of PolarGuide-GSDR, without GNeRP, which trains for hours."""
@@ -100,6 +101,22 @@ def find_captures(folder: Path, name: str) -> list[Path]:
     return captures[:1] if captures[0] == folder else captures
 
 
+def check_recipes(recipes: Sequence[str]) -> None:
+    """Check that the recipes have at least two columns in the table of PolarGuide-GSDR.
+
+    Raises:
+        PolarguideError: there are fewer columns.
+    """
+    columns = [*LAYOUT.columns.values()]
+    require(
+        len({*recipes} & {*columns}) >= 2,
+        "--recipes",
+        expected="at least two of " + ", ".join(columns),
+        found=" ".join(recipes),
+        remedy="Add recipes of the table. Other recipes are possible, but the table leaves them out.",
+    )
+
+
 def published_sections(results: Results, name: str) -> list[Section]:
     """Return the tables: measured scores, published scores of the same captures, and their conditions."""
     dataset = PUBLISHED_DATASETS[name]
@@ -169,6 +186,7 @@ def parsed() -> argparse.Namespace:
 
 def main() -> None:
     options = parsed()
+    check_recipes(options.recipes)
     dataset = PUBLISHED_DATASETS[options.dataset]
     reporter = PrintingReporter()
     scenes = []
@@ -194,6 +212,7 @@ def main() -> None:
     table = options.out / "published.md"
     write_text(table, readable(published_sections(results, options.dataset), "results.md"))
     reporter.say(f"table: {table}")
+    print_results(results, options.out / options.dataset)
 
 
 if __name__ == "__main__":

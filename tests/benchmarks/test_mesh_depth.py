@@ -9,7 +9,7 @@ from random_runs import ring
 
 from polarguide.capture.presentation import Presentation
 from polarguide.geometry.scene_frame import scene_frame
-from polarguide.results.export.mesh import write_mesh
+from polarguide.results.export.formats import write_mesh
 from polarguide.results.export.placement import Placement
 from polarguide.results.rendering.mesh import ColoredMesh, Surface
 

@@ -4,7 +4,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from comparison_records import results, run
+from comparison_records import results, run, unfinished
 from dataset_files import WRITERS
 from faults import Fault
 
@@ -35,6 +35,25 @@ def test_other_datasets_and_missing_folders_are_refused(tmp_path: Path) -> None:
     )
 
 
+@pytest.mark.parametrize("recipes", [["3dgs"], ["3dgs", "3dgs"], ["3dgs", "polarguide"]])
+def test_too_few_recipes_are_refused_before_the_training(recipes: list[str]) -> None:
+    Fault("--recipes", "at least two of gnerp, 3dgs", " ".join(recipes), "Add recipes").raised_by(
+        published.check_recipes, recipes
+    )
+
+
+@pytest.mark.parametrize(
+    "arguments", [["owl"], ["pandora", "x"], ["pandora", "x", "--out", "y", "--steps", "many"]]
+)
+def test_wrong_arguments_end_with_the_usage(
+    arguments: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["published.py", *arguments])
+    with pytest.raises(SystemExit):
+        published.main()
+    assert "usage: published.py" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("name", published.PUBLISHED_DATASETS)
 def test_measured_scores_are_next_to_published_ones(name: str) -> None:
     scored = [run(CAPTURES[name], recipe, 0, psnr=20.125, ssim=0.8) for recipe in ("3dgs", "3dgs-dr")]
@@ -61,6 +80,20 @@ def test_captures_without_published_scores_are_named() -> None:
     ]
     *_, last = published.published_sections(results(scored), "pandora")
     assert "PolarGuide-GSDR has no scores of owl." in last.notes
+
+
+def test_a_failed_run_ends_with_its_error_after_the_table(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    WRITERS["pandora"](tmp_path / "gnome")
+    scored = results([run("gnome", "3dgs", 0, psnr=20.0), unfinished("gnome", "3dgs-dr", 0, "no memory")])
+    monkeypatch.setattr(published.polarguide, "compare", lambda *_, **__: scored)
+    out = tmp_path / "out"
+    monkeypatch.setattr(sys, "argv", ["published.py", "pandora", str(tmp_path / "gnome"), "--out", str(out)])
+    Fault("pandora", "2 finished runs", "gnome, 3dgs-dr, seed 0: no memory", "repeat").raised_by(
+        published.main
+    )
+    assert "Gnome (indoor)" in (out / "published.md").read_text()
 
 
 @pytest.mark.slow

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path
 
@@ -128,7 +127,7 @@ def test_cameras_without_a_size_get_that_of_the_pixels_they_are_of(
     assert reason in line
     (camera,) = poses.developed({"a": Geometry(size, (0, 0), 1, size)}).values()
     assert (camera.width, camera.height) == size
-    assert source.kept == ({"a"} if size == (128, 96) else set())
+    assert source.as_stored == ({"a"} if size == (128, 96) else set())
 
 
 class Tagged(Source):
@@ -136,13 +135,9 @@ class Tagged(Source):
 
     def __init__(self, codes: dict[str, int]) -> None:
         self._codes = codes
-        self.kept: set[str] = set()
 
     def stored(self, view: str) -> Stored:
         return Stored((128, 96), self._codes[view])
-
-    def use_stored(self, views: Collection[str]) -> None:
-        self.kept = set(views)
 
 
 @pytest.mark.parametrize(
@@ -165,5 +160,5 @@ def test_views_decide_for_one_another(
     }
     source = Tagged(codes)
     line = settle_pose_frames(source, Poses.of_cameras(cameras, Path("m"), sorted(cameras)), "auto")
-    assert source.kept == kept
+    assert source.as_stored == kept
     assert bool(line) == any(code != 1 for code in codes.values())

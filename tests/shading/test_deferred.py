@@ -338,3 +338,9 @@ def test_layers_are_held_only_where_asked_for(gaussians: dict[str, Tensor]) -> N
     }
     plain = render(gaussians, camera(), rasterize_cpu, RenderRequest(layers_detached=True), shading=PLAIN)
     assert plain.training.keys() == {"radii"}
+
+
+@pytest.mark.parametrize("index", [1.0, 0.5, float("nan")])
+def test_a_refractive_index_is_more_than_one(index: float) -> None:
+    with pytest.raises(ValueError, match=f"expected more than 1, found {index}"):
+        DeferredShading("fresnel", refractive_index=index)

@@ -27,6 +27,7 @@ from polarguide.gaussians.ply import read_ply
 from polarguide.raster.cpu import rasterize_cpu
 from polarguide.results.export.adapters import ply_fields
 from polarguide.runs.model import gaussian_colors, write_run_ply
+from polarguide.shading.cubemap import ggx_alpha, gltf_roughness
 from polarguide.shading.deferred import DeferredShading
 from polarguide.shading.gbuffer import render, single_colors
 from polarguide.shading.metal import (
@@ -39,7 +40,6 @@ from polarguide.shading.metal import (
     spread_directions,
 )
 from polarguide.shading.model import mirrored
-from polarguide.shading.roughness import ggx_alpha, gltf_roughness
 
 WITHOUT = DeferredShading("fresnel", local=True, rough=True)
 SHADING = DeferredShading("fresnel", local=True, rough=True, metal=True)

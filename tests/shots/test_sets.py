@@ -136,6 +136,22 @@ def test_four_contradicting_angles_are_told(tmp_path: Path) -> None:
     assert not any(fit.left_out for fit in maps.pictures)
 
 
+@pytest.mark.parametrize("angles", [SIX, (0, 45, 95, 135)], ids=["six", "four"])
+def test_stray_light_is_no_wrong_angle(tmp_path: Path, angles: Sequence[float]) -> None:
+    """A lamp in the picture, whose glare moves on the filter and does not follow Malus's law."""
+    pictures = photographed(sphere(), angles).astype(np.float64)
+    rows, columns = np.mgrid[:120, :120]
+    for number, picture in enumerate(pictures):
+        turn = 2.4 * number
+        distance = np.hypot(rows - 20 - 9 * np.sin(turn), columns - 30 - 9 * np.cos(turn))
+        picture += 30_000 * np.exp(-((distance / 12) ** 2))
+    maps = read(tmp_path, np.minimum(pictures, 65535).astype(np.uint16), angles)
+    assert not any("angle is probably wrong" in note or "angles contradict" in note for note in maps.notes)
+    for fit in maps.pictures:
+        assert fit.looks_like is None or fit.looks_like == pytest.approx(fit.angle, abs=2)
+    assert any("motion" in note for note in maps.notes)
+
+
 def test_outliers_and_clipped_samples_are_left_out_pixel_by_pixel(tmp_path: Path) -> None:
     stokes = sphere()
     pictures = photographed(stokes, SIX)

@@ -100,6 +100,18 @@ def test_entries_come_back_from_memory_and_file(tmp_path: Path) -> None:
     assert same(fetched(store, "v3", maker(20)), entry_of(20))
 
 
+def test_a_new_entry_replaces_the_old_one(tmp_path: Path) -> None:
+    for store in (ViewStore(), ViewStore(0, tmp_path)):
+        assert store.get("kind", "v") is None
+        store.keep("kind", "v", entry_of(0))
+        sizes = (store.in_memory, store.in_file)
+        store.keep("kind", "v", entry_of(1))
+        assert (store.in_memory, store.in_file) == sizes
+        replaced = store.get("kind", "v")
+        assert replaced is not None
+        assert same(replaced, entry_of(1))
+
+
 def test_what_can_be_had_cheaply_is_not_put_into_the_file(tmp_path: Path) -> None:
     store, made = ViewStore(0, tmp_path), []
     for _ in range(2):

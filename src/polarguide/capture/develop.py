@@ -146,10 +146,11 @@ def align_shots(
 
     Returns:
         The aligned intensities; for each of ``masks`` a mask [H, W] of the pixels that depend on a marked pixel of some
-        shot; and a mask [H, W] of the pixels that depend on a place outside a shot.
+        shot; and a mask [H, W] of the pixels that depend on a place outside a shot. If no shot moved, the intensities
+        are ``linear`` itself.
     """
     height, width = linear.shape[1:3]
-    moved = linear.copy()
+    moved = linear.copy() if any(shift.corrected for shift in shifts) else linear
     each = [np.broadcast_to(mask, linear.shape[:3]).copy() for mask in masks]
     outside = np.zeros((height, width), bool)
     for index, shift in enumerate(shifts):

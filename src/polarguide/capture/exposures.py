@@ -8,7 +8,7 @@ import os
 import posixpath
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -170,14 +170,6 @@ def determine_stokes(exposures: Sequence[Exposure]) -> bool:
     return conditioning(nominal([e for e in exposures if e.known])) >= WELL_CONDITIONED
 
 
-def measure_radiance(exposures: Sequence[Exposure]) -> bool:
-    """Return True if the exposures measure S0.
-
-    S0 follows from a picture without a filter, from two pictures at a right angle, or from a full Stokes vector.
-    """
-    return determine_stokes(exposures) or bool(radiance_places(exposures))
-
-
 def radiance_places(exposures: Sequence[Exposure]) -> tuple[int, ...]:
     """Return the indices of the exposures whose mean is ``S0 / 2``.
 
@@ -196,11 +188,6 @@ def normalized(angle: float) -> float:
     """Return an angle in degrees modulo 180, in [0, 180)."""
     remainder = angle % 180.0
     return 0.0 if remainder == 180.0 else remainder  # tiny negative angles round to 180
-
-
-def with_estimate(exposure: Exposure, angle: float, gain: float) -> Exposure:
-    """Return an exposure with its angle in degrees and its gain replaced by estimates."""
-    return replace(exposure, angle=normalized(angle), gain=gain)
 
 
 TABLE = "angles.csv"

@@ -18,7 +18,7 @@ import contextlib
 import math
 import os
 import re
-from collections.abc import Container, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -339,14 +339,21 @@ def index_files(folder: Path, suffixes: tuple[str, ...], ignored: Container[str]
     Raises:
         PolarguideError: two files have the same stem.
     """
+    paths = (path for path in list_files(folder, suffixes) if canonical(path.name) not in ignored)
+    return _index(folder, paths, stem_of)
+
+
+def _index(folder: Path, paths: Iterable[Path], name: Callable[[Path], str]) -> dict[str, Path]:
+    """Return files by name.
+
+    Raises:
+        PolarguideError: two files have the same name.
+    """
     files: dict[str, Path] = {}
-    for path in list_files(folder, suffixes):
-        if canonical(path.name) in ignored:
-            continue
-        stem = stem_of(path)
-        if stem in files:
-            raise ambiguous(folder, f"one file called {stem}", files[stem], path)
-        files[stem] = path
+    for path in paths:
+        first = files.setdefault(name(path), path)
+        if first is not path:
+            raise ambiguous(folder, f"one file called {name(path)}", first, path)
     return files
 
 
@@ -592,13 +599,7 @@ def index_shot_files(folder: Path, suffixes: tuple[str, ...]) -> dict[str, Path]
     Raises:
         PolarguideError: files with two suffixes have the same name.
     """
-    files: dict[str, Path] = {}
-    for path in list_shot_files(folder, suffixes):
-        shot = shot_stem(path)
-        if shot in files:
-            raise ambiguous(folder, f"one file called {shot}", files[shot], path)
-        files[shot] = path
-    return files
+    return _index(folder, list_shot_files(folder, suffixes), shot_stem)
 
 
 def _is_labeled(path: Path) -> bool:

@@ -35,6 +35,7 @@ class SetLimits:
         fewest_pixels: smallest number of pixels for a comparison.
         determined: largest standard error in degrees at which an estimated angle is reported.
         over_noise: smallest ratio of the polarization's variation over the picture to its noise.
+        explained: share of the squared residual above which another angle explains most of a contradiction.
     """
 
     marks = 2.0
@@ -44,6 +45,7 @@ class SetLimits:
     fewest_pixels = 200
     determined = 1.0
     over_noise = 3.0
+    explained = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,7 +118,7 @@ class PictureFit:
         angle: stated polarizer angle as displayed, in degrees.
         gain: number by which the values of the picture are divided.
         looks_like: angle in degrees at which the prediction matches the picture best. It is ``None`` if the light does
-            not determine the angle.
+            not determine the angle, or if the angle differs from the stated one without explaining the residual.
         error: standard error of ``looks_like`` in degrees, or None.
         residual: root mean square of the residuals, relative to full scale.
         left_out: True if the picture is excluded from the fit of Stokes vectors.
@@ -153,11 +155,23 @@ class _Prediction(AngleEstimate):
     Attributes:
         gain: ratio of the picture's brightness to the predicted brightness.
         residual: root mean square of the differences from the prediction.
+        explained: share of the squared differences that the estimated angle and gain remove.
     """
 
     floor: float = SetLimits.marks
     gain: float = 1.0
     residual: float = 0.0
+    explained: float = 0.0
+
+    @property
+    def agrees(self) -> bool:
+        """True if the estimated angle agrees with the stated one within the precision of the marks."""
+        return abs(self.off) <= SetLimits.marks
+
+    @property
+    def explains(self) -> bool:
+        """True if the estimated angle explains most of the differences, unlike for motion or stray light."""
+        return self.explained > SetLimits.explained
 
 
 def chosen_pixels(samples: SetSamples) -> tuple[NDArray[Any], NDArray[Any]]:
@@ -201,19 +215,25 @@ def judge(samples: SetSamples, gray: Floats) -> SetJudgment:
         reasons[worst] = _reason(samples, worst, predicted[worst])
     notes = [reasons[k] for k in sorted(reasons)]
     final = _predictions(samples, gray, used, np.ones(count, bool))
-    off_by = [abs(final[k].off) for k in np.flatnonzero(used).tolist() if final[k].angle is not None]
-    if count > 3 and off_by and np.median(off_by) > SetLimits.marks:
+    determined = [final[k] for k in np.flatnonzero(used).tolist() if final[k].angle is not None]
+    off_by = float(np.median([abs(fit.off) for fit in determined])) if determined else 0.0
+    if count > 3 and off_by > SetLimits.marks:
         notes.append(
-            f"The angles contradict each other by {np.median(off_by):.0f} degrees (median). "
+            f"The angles contradict each other by {off_by:.0f} degrees (median). "
             f"{int(used.sum())} pictures are too few to identify the wrong ones."
+            if any(fit.explains for fit in determined)
+            else "The pictures contradict each other, and wrong angles explain at most half of it. Look also for "
+            "motion, changing light, and glare around a lamp."
         )
     fits = tuple(
         PictureFit(
             label=samples.labels[k],
             angle=samples.exposures[k].angle or 0.0,
             gain=samples.exposures[k].gain,
-            looks_like=None if fit.angle is None else round(fit.angle, 1),
-            error=None if fit.angle is None else fit.error,
+            looks_like=round(fit.angle, 1)
+            if fit.angle is not None and (fit.agrees or fit.explains)
+            else None,
+            error=fit.error if fit.angle is not None and (fit.agrees or fit.explains) else None,
             residual=fit.residual,
             left_out=not used[k],
         )
@@ -242,9 +262,9 @@ def _contradicts(samples: SetSamples, gray: Floats, used: Mask, worst: int, pred
 def _reason(samples: SetSamples, k: int, predicted: _Prediction) -> str:
     """Describe for the user why a picture is rejected."""
     change = predicted.gain - 1
-    if predicted.angle is not None and abs(predicted.off) > SetLimits.marks:
+    if predicted.explains and not predicted.agrees:
         reason = f"looks like {predicted.angle:.0f} degrees: its angle is probably wrong"
-    elif abs(change) > SetLimits.brighter:
+    elif predicted.explains and abs(change) > SetLimits.brighter:
         way = "brighter" if change > 0 else "darker"
         reason = f"is {abs(change):.0%} {way} than the others predict (exposure or light)"
     else:
@@ -303,7 +323,10 @@ def _predict(rows: Floats, gray: Floats, others: Mask, k: int, stated: float) ->
     if certain:
         error = math.degrees(math.sqrt(noise * (1 + leverage) / (pixels * spread)) / float(gain[best]))
     angle = float(angles[best]) if error < SetLimits.determined else None
-    return _Prediction(angle, error, stated, gain=float(gain[best]), residual=residual)
+    before = float(np.sum((picture - rows[k] @ stokes) ** 2))
+    after = float(np.sum((picture - float(gain[best]) / 2 * form @ stokes) ** 2))
+    explained = 1 - after / before if before else 0.0
+    return _Prediction(angle, error, stated, gain=float(gain[best]), residual=residual, explained=explained)
 
 
 def typical_variance(squares: Floats, freedom: int) -> float:

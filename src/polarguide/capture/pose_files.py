@@ -25,6 +25,7 @@ from polarguide.capture.datasets.dataset import (
     POSE_SHAPES,
     checked_intrinsics,
     checked_pose,
+    numbered_views,
     pinhole_camera,
     read_projections,
     require_known_names,
@@ -484,7 +485,7 @@ def _idr(path: Path, views: Sequence[str], sizes: Sizes) -> dict[str, PosedCamer
         PolarguideError: the match is ambiguous.
     """
     cameras = read_projections(path).cameras
-    numbered = {view: int(view) for view in views if view.isascii() and view.isdigit() and len(view) < 7}
+    numbered = numbered_views(set(views))
     named = len(numbered) == len(views)
     order = sorted(views, key=lambda view: numbered[view]) if named else sorted(views)
     in_order = dict(zip(order, sorted(cameras), strict=False))

@@ -472,7 +472,7 @@ def load_scene(
     files = Files()
     for file in (*model.files, *([layout.table] if layout.table is not None else [])):
         files.read(file)
-    tests = _held_out(root / "split.json", files, layout, model, split, test_views)
+    tests = held_out_names(files, layout, model, split, test_views)
     about = files.read_if_there(root / "scene.json", b"{}")
     index = refractive_index_of(root / "scene.json", about)
     indices = indices_of(root / "scene.json", about)
@@ -534,19 +534,22 @@ def load_scene(
     )
 
 
-def _held_out(
-    path: Path,
+def held_out_names(
     files: Files,
     layout: CaptureFiles,
-    model: ColmapModel,
-    split: Split,
-    test_views: Sequence[str] | None,
+    model: ColmapModel | None,
+    split: Split = "directions",
+    test_views: Sequence[str] | None = None,
 ) -> tuple[str, ...]:
-    """Choose the held-out views, and return their names."""
+    """Choose the held-out views, and return their names.
+
+    They are ``test_views``, else the views in ``split.json``, else views that ``split`` chooses.
+    """
     check_choice("split", split, get_args(Split))
+    path = layout.root / "split.json"
     data = files.read_if_there(path, None)
-    posed = frozenset(model.names)
-    cameras = {name: model.camera(name) for name in layout.names if name in posed}
+    posed = frozenset(() if model is None else model.names)
+    cameras = {name: model.camera(name) for name in layout.names if model is not None and name in posed}
     if test_views is not None:
         return tuple(name for name in sorted(test_views) if name in layout.names)
     return chosen_views(cameras, split) if data is None else held_out(path, data, layout.names)

@@ -20,7 +20,6 @@ from polarguide.capture.exposures import (
     Exposure,
     analyzers,
     determine_stokes,
-    measure_radiance,
     radiance_places,
 )
 from polarguide.capture.formats.pictures import FULL_CODE as FULL_CODE
@@ -212,8 +211,11 @@ class View:
 
     @property
     def measures_radiance(self) -> bool:
-        """True if the pictures measure S0."""
-        return self.exposures == FOUR or measure_radiance(self.exposures)
+        """True if the pictures measure S0.
+
+        S0 follows from a picture without a filter, from two pictures at a right angle, or from a full Stokes vector.
+        """
+        return self.is_determined or bool(radiance_places(self.exposures))
 
     def to(self, device: torch.device) -> View:
         """Return a copy of the view on a device, without ground truth.

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import math
 import os
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -24,19 +23,17 @@ from polarguide.capture.layout import CaptureFiles, find_layout, select_views
 from polarguide.capture.metadata import (
     Origin,
     applied_calibration,
-    held_out,
     indices_of,
     keeps_gains,
     origin_of,
     refractive_index_of,
 )
 from polarguide.capture.point_exposures import PointExposures
-from polarguide.capture.scene import chosen_views, read_views
+from polarguide.capture.scene import held_out_names, read_views
 from polarguide.capture.view import FULL_CODE
-from polarguide.core.files import read_file
+from polarguide.capture.view_reader import Files
 from polarguide.core.options import check_choice
 from polarguide.core.progress import SILENT, Reporter
-from polarguide.core.records import LARGEST_RECORD
 from polarguide.geometry.camera import Camera
 
 LONGEST = 640
@@ -161,7 +158,8 @@ def read_capture(
     names = select_views(layout, None)
     model = read_model(root) if (root / "sparse").exists() else None
     metadata = root / "scene.json"
-    text = read_file(metadata, largest=LARGEST_RECORD) if metadata.exists() else b"{}"
+    files = Files()
+    text = files.read_if_there(metadata, b"{}")
     first = layout.files(names[0])[0]
     factor = downscale or max(
         1,
@@ -198,16 +196,8 @@ def read_capture(
         origin=origin_of(metadata, text),
         exposures=stored.exposures,
         keeps_gains=keeps_gains(metadata, text),
-        test_names=_test_names(root / "split.json", names, model),
+        test_names=held_out_names(files, layout, model),
     )
-
-
-def _test_names(path: Path, names: Sequence[str], model: ColmapModel | None) -> tuple[str, ...]:
-    """Return the names of the views that a training holds out by default."""
-    if path.exists():
-        return held_out(path, read_file(path, largest=LARGEST_RECORD), list(names))
-    posed = frozenset(() if model is None else model.names)
-    return chosen_views({name: model.camera(name) for name in names if model and name in posed}, "directions")
 
 
 MEASURABLE = 1.0 / 256.0

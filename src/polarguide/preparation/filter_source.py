@@ -8,7 +8,7 @@ import itertools
 import math
 import warnings
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -149,7 +149,6 @@ class ShotsSource(Source):
             found="srgb",
             remedy="Remove the option.",
         )
-        self._as_stored: frozenset[str] = frozenset()
 
     def stored(self, view: str) -> Stored:
         """Return size and orientation of a view, from the header of its first shot."""
@@ -161,14 +160,6 @@ class ShotsSource(Source):
     def lenses(self) -> dict[str, Lens]:
         """Return the lens of each view, from the EXIF tags of its first shot."""
         return camera_groups({view: paths[0] for view, paths in self._of_view.items()})
-
-    def use_stored(self, views: Collection[str]) -> None:
-        """Develop some views without rotation, regardless of their orientation tags."""
-        self._as_stored = frozenset(views)
-
-    def used_as_stored(self, view: str) -> bool:
-        """Return True if a view is developed without rotation, regardless of its orientation tag."""
-        return view in self._as_stored
 
     def _require_memory(self, what: str) -> None:
         """Check that the shots of the largest view fit into memory. Only headers are read.
@@ -226,7 +217,7 @@ class ShotsSource(Source):
     def _merged(self, view: str, levels: Levels | None, transfer: str, *, align: bool) -> LinearShots:
         """Return the linear shots of a view. They are aligned if ``align`` is True."""
         read = BracketedShots.read(self._of_view[view], levels)
-        if self.used_as_stored(view):
+        if view in self.as_stored:
             read = replace(read, shots=[replace(shots, orientation=1) for shots in read.shots])
         return LinearShots.of(read, transfer, align=align)
 

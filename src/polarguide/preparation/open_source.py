@@ -479,8 +479,8 @@ def settle_pose_frames(pictures: Source, poses: Poses, frame_given: str) -> str:
         default = frame_given == "stored"
         by_size.clear()
         reason = "according to --poses-of"
-    as_stored = [view for view in codes if by_size.get(view, default)]
-    pictures.use_stored(as_stored)
+    as_stored = frozenset(view for view in codes if by_size.get(view, default))
+    pictures.as_stored = as_stored
     turns = listed([f"{count} {TURNS[code]}" for code, count in sorted(Counter(codes.values()).items())])
     other = "displayed" if as_stored else "stored"
     text = f"the poses refer to the {'stored' if as_stored else 'displayed'} pixels, {reason}"

@@ -239,14 +239,13 @@ def _structure(folder: SceneFolder, pictures: Source, settings: PrepareSettings,
     """
     photographs = _photographs(folder, pictures, settings, reporter, pictures.views)
     matching = chosen_matching(pictures.views, settings.matching, reporter)
-    settings = replace(settings, matching=matching)  # type: ignore[arg-type]
     return reconstruct(
         folder.root / SFM,
         {view: geometry.size for view, geometry in photographs.items()},
         matching=matching,
         seed=settings.seed,
         reporter=reporter,
-        untried=_untried(settings, pictures.kind),
+        untried=_untried(settings, matching, pictures.kind),
         intrinsics=None if settings.intrinsics is None else known_intrinsics(settings.intrinsics),
         lenses=pictures.lenses(),
     )
@@ -302,9 +301,9 @@ def _photographs(
     return {view: known[view] for view in views}
 
 
-def _untried(settings: PrepareSettings, kind: str) -> str:
+def _untried(settings: PrepareSettings, matching: str, kind: str) -> str:
     """Return the options that may improve structure from motion and were not used, for a message."""
-    ways = ["--matching exhaustive (compares all pairs)"] if settings.matching != "exhaustive" else []
+    ways = ["--matching exhaustive (compares all pairs)"] if matching != "exhaustive" else []
     if settings.sfm_pictures != "minimum" and kind != "singles":  # the minimum of one picture is the picture
         ways.append("--sfm-pictures minimum (less glare)")
     if settings.intrinsics is None:

@@ -10,7 +10,7 @@ import hashlib
 import math
 import os
 import warnings
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -279,6 +279,7 @@ class Source(Protocol):
         views: view names, sorted.
         paths: all files that are read except masks.
         masks: object masks of the user by view. Values of at least half of the maximum mark the object.
+        as_stored: views that are developed without rotation, regardless of their orientation tags.
         measured_type: type of the result of ``measure``.
     """
 
@@ -288,6 +289,7 @@ class Source(Protocol):
     views: list[str]
     paths: list[Path]
     masks: Mapping[str, Path] = MappingProxyType({})
+    as_stored: frozenset[str] = frozenset()
 
     @property
     def description(self) -> str:
@@ -307,17 +309,6 @@ class Source(Protocol):
         """Return the lens of each view if the files state different lenses, else an empty dictionary."""
         return {}
 
-    def use_stored(self, views: Collection[str]) -> None:
-        """Develop some views as stored, without applying their orientation tags. Call this before ``develop``.
-
-        The base class does nothing, because its files have no orientation.
-        """
-        return None
-
-    def used_as_stored(self, view: str) -> bool:
-        """Return True if a view is developed as stored, because ``use_stored`` selected it."""
-        return False
-
 
 def develop_view(pictures: Source, view: str, measured: Measured) -> DevelopedView:
     """Develop a view with ``Source.develop``, and add its mask.
@@ -329,7 +320,7 @@ def develop_view(pictures: Source, view: str, measured: Measured) -> DevelopedVi
     if view not in pictures.masks:
         return done
     code = pictures.stored(view).orientation
-    code = INVERSE[code] if pictures.used_as_stored(view) else code
+    code = INVERSE[code] if view in pictures.as_stored else code
     return replace(done, mask=_fit_mask(pictures.masks[view], done, code))
 
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from polarguide.core.native import fits
 from polarguide.geometry.camera import Camera, dot, unit
 from polarguide.optics import reflectances_from_cosine
-from polarguide.shading.cubemap import cubemap_lookup, mip_lookup
+from polarguide.shading.cubemap import LEVELS, cubemap_lookup, gltf_roughness, light_levels, mip_lookup
 from polarguide.shading.metal import (
     FIRST_REFLECTANCE,
     metal_pixels,
@@ -34,7 +34,6 @@ from polarguide.shading.model import (
 )
 from polarguide.shading.native import shade_native
 from polarguide.shading.result import LAYERS
-from polarguide.shading.roughness import LEVELS, gltf_roughness, light_levels
 from polarguide.shading.surface import SurfaceProperty, surface_channels
 
 Blend = Literal["lerp", "fresnel"]

@@ -16,11 +16,10 @@ from torch.autograd.function import once_differentiable
 from polarguide import _native
 from polarguide.core.native import applied
 from polarguide.geometry.camera import Camera
-from polarguide.shading.cubemap import mips_backward
+from polarguide.shading.cubemap import LEVELS, mips_backward
 from polarguide.shading.metal import MINIMUM_SHARE, where_metal
 from polarguide.shading.model import GBuffer
 from polarguide.shading.result import MetalPixels, first_channel
-from polarguide.shading.roughness import LEVELS
 
 
 class MetalArguments(NamedTuple):

@@ -17,7 +17,7 @@ from random_runs import ring
 from polarguide.core.errors import PolarguideError
 from polarguide.geometry.camera import Camera
 from polarguide.geometry.scene_frame import scene_frame
-from polarguide.results.export.mesh import write_mesh
+from polarguide.results.export.formats import write_mesh
 from polarguide.results.rendering.mesh import (
     Surface,
     box_around,

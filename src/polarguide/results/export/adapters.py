@@ -18,11 +18,10 @@ from torch import Tensor
 from polarguide.gaussians.gaussians import Parameters
 from polarguide.gaussians.harmonics import SH_C0
 from polarguide.optics import reflectances_from_cosine
-from polarguide.shading.cubemap import box_mips
+from polarguide.shading.cubemap import box_mips, ggx_alpha, gltf_roughness
 from polarguide.shading.deferred import LOCAL_NOTE, DeferredShading
 from polarguide.shading.directional import DirectionalShading
 from polarguide.shading.model import Light, PlainShading, ShadingModel
-from polarguide.shading.roughness import ggx_alpha, gltf_roughness
 from polarguide.shading.surface import surface_channels
 
 INDEX_NOTE = (

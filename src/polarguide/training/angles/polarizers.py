@@ -20,7 +20,7 @@ from torch import Tensor
 from polarguide import optics
 from polarguide.capture import Scene, View
 from polarguide.capture.angle_evidence import TO_DEVIATION, AngleEstimate, mean_angle
-from polarguide.capture.exposures import Exposure, with_estimate
+from polarguide.capture.exposures import Exposure, normalized
 from polarguide.capture.variants import smaller
 from polarguide.capture.view import ANGLES
 from polarguide.core.progress import SILENT
@@ -481,7 +481,7 @@ def _belief(judgment: Judgment, common: float | None) -> Exposure:
     if not judgment.guesses:
         return specified
     gain = specified.gain if common is None else specified.gain * judgment.gain / common
-    return with_estimate(specified, judgment.angle, gain)
+    return replace(specified, angle=normalized(judgment.angle), gain=gain)
 
 
 class AngleFits(Callback[TrainingLoop]):
