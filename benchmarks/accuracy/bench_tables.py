@@ -31,7 +31,7 @@ from bench_records import (
 from losses import LAYERS, NORMALS, bad_views, gain_table, loss_tables, without_polarization
 from scipy import stats
 
-from polarguide.core.errors import PolarguideError
+from polarguide.core.errors import PolarguideError, require
 from polarguide.results.evaluation.table import OBJECT_METRICS
 
 COLUMNS = {
@@ -189,23 +189,41 @@ def tables(scenes: Scenes, others: Sequence[str]) -> Iterator[str]:
             yield from ("", *(f"- {line}" for line in bad_views(scene, rows, RECIPE, others)))
 
 
+def check_recipes(scenes: Scenes, names: Sequence[str]) -> None:
+    """Check that the records contain all named recipes.
+
+    Raises:
+        PolarguideError: a recipe occurs in no scene.
+    """
+    recorded = {name for rows in scenes.values() for name in rows}
+    absent = [name for name in names if name not in recorded]
+    require(
+        not absent,
+        "--against",
+        expected=f"recipes of the records: {', '.join(sorted(recorded))}",
+        found=", ".join(absent),
+        remedy="Correct the names.",
+    )
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("records", type=Path, nargs="+", help="results.json of polarguide bench or compare")
     parser.add_argument(
-        "--against", nargs="+", default=without_polarization(RECIPE), help="recipes without polarization"
+        "--against", nargs="+", help="recipes without polarization; the default is all of them in the records"
     )
     options = parser.parse_args()
     try:
         scenes = read_scenes(options.records)
         versions = code_versions(options.records)
+        check_recipes(scenes, options.against or ())
     except PolarguideError as error:
         parser.error(str(error))
     comparable = "" if len(versions) == 1 else " Values of different versions are not comparable."
     print(f"Version of the code: {', '.join(versions)}.{comparable}\n")
-    print(*tables(scenes, options.against), sep="\n")
+    print(*tables(scenes, options.against or without_polarization(RECIPE)), sep="\n")
 
 
 if __name__ == "__main__":

@@ -21,18 +21,21 @@ import argparse
 import shlex
 import shutil
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 
 import msgspec
 
 import polarguide
-from polarguide.core.errors import PolarguideError
+from polarguide.core.errors import PolarguideError, require
 from polarguide.core.files import make_folder
 from polarguide.core.progress import Reporter
 from polarguide.core.records import read_record
 from polarguide.training.settings import TrainSettings
 from polarguide_bench.options import CompareOptions
 from polarguide_bench.recipes import recipe_named
+from polarguide_bench.results import Results
+from polarguide_bench.verbs import print_results
 
 HERE = Path(__file__).resolve().parent
 RECORDS = HERE.parent / "results" / "final"
@@ -88,13 +91,30 @@ def read_part(path: Path) -> Part:
     return part
 
 
-def measure(part: Part, scenes: Path, out: Path, *, jobs: int, threads: int) -> None:
-    """Train and score the runs of a part that are not finished.
+def check_scenes(parts: Iterable[Part], scenes: Path) -> None:
+    """Check that the scene folders of all parts exist, before a measurement of days begins.
 
     Raises:
-        PolarguideError: a scene is missing, or the comparison fails.
+        PolarguideError: at least one folder is missing.
     """
-    polarguide.compare(
+    folders = [scenes / part.folder / name for part in parts for name in part.scenes]
+    missing = sorted({str(folder) for folder in folders if not folder.is_dir()})
+    require(
+        not missing,
+        scenes,
+        expected="the scene folders of all parts",
+        found=f"no folder {', '.join(missing)}",
+        remedy="Render or copy these scenes, or choose other parts by --parts.",
+    )
+
+
+def measure(part: Part, scenes: Path, out: Path, *, jobs: int, threads: int) -> Results:
+    """Train and score the runs of a part that are not finished, and return their results.
+
+    Raises:
+        PolarguideError: the comparison fails.
+    """
+    return polarguide.compare(
         [scenes / part.folder / name for name in part.scenes],
         list(part.recipes),
         out,
@@ -129,15 +149,19 @@ def main() -> None:
             Path(name).stem: read_part(HERE / f"{name}.json" if name in PARTS else Path(name))
             for name in options.parts
         }
+        check_scenes(parts.values(), options.scenes)
         make_folder(options.records)
+        results = {}
         for name, part in parts.items():
             print(f"{name}: {part.about}", flush=True)
             out = options.out / name
             try:
-                measure(part, options.scenes, out, jobs=options.jobs, threads=options.threads)
+                results[out] = measure(part, options.scenes, out, jobs=options.jobs, threads=options.threads)
             finally:
                 if (out / "results.json").exists():
                     shutil.copyfile(out / "results.json", options.records / f"{name}.json")
+        for out, part_results in results.items():
+            print_results(part_results, out)
     except PolarguideError as error:
         parser.error(str(error))
     except KeyboardInterrupt:

@@ -126,8 +126,8 @@ class Ours:
                 torch.autograd.grad(photometric_loss(prediction, shown), prediction)
 
         def optimizer() -> None:
-            for t in gaussians.trained():
-                t.grad = torch.zeros_like(t)
+            for name in gaussians.names:
+                gaussians[name].grad = torch.zeros_like(gaussians[name])
             trainer.update_parameters()
 
         return {"rasterizer": raster, "ssim": ssim, "optimizer": optimizer}

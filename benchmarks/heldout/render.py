@@ -1,4 +1,4 @@
-"""Render and prepare the scenes of the held-back half, and compare them with their recorded checksums.
+"""Render and prepare the scenes of the held-back half, and record or compare their checksums.
 
 The scenes test a finished method. Do not look at them, and do not train on them, before the method is finished.
 Each scene is rendered as raw mosaics with the noise and the 12 bits of a sensor. ``prepare`` develops the mosaics, so

@@ -128,7 +128,7 @@ def published_sections(results: Results, name: str) -> list[Section]:
     absent = [scene for scene in results.scenes if scene not in dataset.blocks]
     notes = list(dataset.notes)
     if absent:
-        notes.append(f"PolarGuide-GSDR has no scores of {', '.join(absent)}.")
+        notes.append(f"No published scores are recorded for {', '.join(absent)}.")
     return [
         measured._replace(title=f"Measured on {dataset.source}"),
         *([published] if wanted else []),

@@ -176,7 +176,7 @@ class SurfelWeights(Weights):
 def polarization_term(step: Step, weights: SurfelWeights) -> Tensor | None:
     """Return the weighted sum of the L1 distances of S1/2 and S2/2, over reliable pixels."""
     priors = step.targets.priors
-    if priors is None or not weights.polarization or not step.result.is_polarized:
+    if priors is None or not weights.polarization or "specular" not in step.shading.layers:
         return None
     predicted = step.shading.predicted_stokes(step.result, priors.camera)
     distance = (predicted[1:] - priors.stokes[1:]).abs().mean(dim=(0, -1))

@@ -60,6 +60,18 @@ def test_a_wrong_part_is_refused(text: str, fault: str, tmp_path: Path) -> None:
         measure.read_part(tmp_path / "part.json")
 
 
+def test_all_scenes_are_checked_before_the_first_training(tmp_path: Path) -> None:
+    parts = [measure.read_part(measure.HERE / f"{name}.json") for name in ("four", "heldout")]
+    for part in parts:
+        for name in part.scenes:
+            (tmp_path / part.folder / name).mkdir(parents=True)
+    measure.check_scenes(parts, tmp_path)
+    absent = tmp_path / parts[1].folder / parts[1].scenes[-1]
+    absent.rmdir()
+    with pytest.raises(PolarguideError, match=absent.name):
+        measure.check_scenes(parts, tmp_path)
+
+
 @pytest.mark.parametrize("name", render.SCENES)
 def test_a_held_back_scene_has_its_views(name: str) -> None:
     scene = find_scene(str(render.HERE / f"{name}.json"))

@@ -163,9 +163,9 @@ def test_a_tiff_is_not_read_whole_for_its_size(
     (start,) = struct.unpack_from("<Q" if big else "<I", data, at)
     struct.pack_into("<Q" if big else "<I", data, at, len(data))
     path.write_bytes(bytes(data) + bytes(data[start : start + 400]))
-    monkeypatch.setattr("polarguide.capture.formats.pictures.open", lambda p, mode: Counted(p), raising=False)
+    monkeypatch.setattr("polarguide.capture.formats.stored.open", lambda p, mode: Counted(p), raising=False)
     assert stated_size(path) == (900, 700)
-    assert sum(read) < 2000
+    assert 0 < sum(read) < 2000
 
 
 def test_a_picture_file_far_larger_than_its_pixels_is_not_read(tmp_path: Path) -> None:

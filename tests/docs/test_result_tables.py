@@ -7,6 +7,7 @@ from statistics import fmean, stdev
 
 import pytest
 
+from polarguide.core.errors import PolarguideError
 from polarguide_bench.join import LAYOUTS, measured_section
 from polarguide_bench.results import Results, read_results
 from polarguide_bench.tables import against_section
@@ -102,6 +103,13 @@ def test_losses():
     assert [tuple(row.values()) for row in method] == [tuple(row.values()) for row in by_method]
     text = " ".join((ROOT / "docs" / "results" / "bench-held-back.md").read_text(encoding="utf-8").split())
     assert lines[0] in text
+
+
+def test_an_unknown_recipe_is_refused():
+    scenes = scenes_of("bench", ["cup"])
+    bench_tables.check_recipes(scenes, ["3dgs", "ref-gs"])
+    with pytest.raises(PolarguideError, match="3dgss"):
+        bench_tables.check_recipes(scenes, ["3dgs", "3dgss"])
 
 
 def test_mean_gains():

@@ -36,6 +36,7 @@ class SetLimits:
         determined: largest standard error in degrees at which an estimated angle is reported.
         over_noise: smallest ratio of the polarization's variation over the picture to its noise.
         explained: share of the squared residual above which another angle explains most of a contradiction.
+        moving: share of pixels that this test ignores. They have the largest residuals at the other angle, as motion has.
     """
 
     marks = 2.0
@@ -46,6 +47,7 @@ class SetLimits:
     determined = 1.0
     over_noise = 3.0
     explained = 0.5
+    moving = 0.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -323,9 +325,11 @@ def _predict(rows: Floats, gray: Floats, others: Mask, k: int, stated: float) ->
     if certain:
         error = math.degrees(math.sqrt(noise * (1 + leverage) / (pixels * spread)) / float(gain[best]))
     angle = float(angles[best]) if error < SetLimits.determined else None
-    before = float(np.sum((picture - rows[k] @ stokes) ** 2))
-    after = float(np.sum((picture - float(gain[best]) / 2 * form @ stokes) ** 2))
-    explained = 1 - after / before if before else 0.0
+    before = (picture - rows[k] @ stokes) ** 2
+    after = (picture - float(gain[best]) / 2 * form @ stokes) ** 2
+    still = after <= np.quantile(after, 1 - SetLimits.moving)
+    total = float(before[still].sum())
+    explained = 1 - float(after[still].sum()) / total if total else 0.0
     return _Prediction(angle, error, stated, gain=float(gain[best]), residual=residual, explained=explained)
 
 

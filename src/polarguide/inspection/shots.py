@@ -240,8 +240,8 @@ def determined_sets(capture: Capture) -> Iterator[tuple[str, SetSamples]]:
 def strong_polarization(capture: Capture, index: float) -> list[float]:
     """Return the share of pixels with a DoLP above the limit of diffuse light, for each of ``determined_sets``.
 
-    The DoLP has to exceed the limit by three times its noise, which is the residual of the fit. Three pictures have no
-    residual. Dark pixels, see ``MEASURABLE``, do not count.
+    The DoLP has to exceed the limit by three times its noise, which is the residual of the fit. Views with three pictures
+    are left out, because they have no residual. Dark pixels, see ``MEASURABLE``, do not count.
 
     Args:
         capture: the capture.
@@ -250,6 +250,9 @@ def strong_polarization(capture: Capture, index: float) -> list[float]:
     limit = float(optics.diffuse_dolp_limit(index))
     shares = []
     for _, samples in determined_sets(capture):
+        freedom = len(samples.labels) - 3
+        if not freedom:
+            continue
         gray = samples.gray(chosen_pixels(samples)).astype(np.float64)
         gray = gray[:, gray.mean(axis=0) >= MEASURABLE]
         if not gray.shape[1]:
@@ -257,12 +260,7 @@ def strong_polarization(capture: Capture, index: float) -> list[float]:
         inverse = np.linalg.pinv(samples.rows.astype(np.float64))
         s0, s1, s2 = inverse @ gray
         squares = ((gray - samples.rows @ np.stack([s0, s1, s2])) ** 2).sum(axis=0)
-        freedom = len(gray) - 3
-        noise = (
-            math.sqrt(typical_variance(squares, freedom) * float((inverse[1:] ** 2).sum()) / 2)
-            if freedom
-            else 0.0
-        )
+        noise = math.sqrt(typical_variance(squares, freedom) * float((inverse[1:] ** 2).sum()) / 2)
         shares.append(float(np.mean(np.hypot(s1, s2) - 3 * noise > limit * s0)))
     return shares
 

@@ -539,9 +539,9 @@ def normal_terms(step: Step, weights: Weights) -> Tensor:
             )
             if factor
         ]
-        if weights.stokes and result.is_polarized and not has_kernel:
+        if weights.stokes and "specular" in shading.layers and not has_kernel:
             further = weights.stokes * stokes_loss(result, priors, shading)
-        elif weights.stokes and result.is_polarized:
+        elif weights.stokes and "specular" in shading.layers:
             measured = priors.stokes[1:]
             stokes = PolarizationTerm(
                 measured,
@@ -579,7 +579,7 @@ def normal_terms_reference(step: Step, weights: Weights) -> Tensor:
         ):
             if weight and "normal" in result.layers:
                 total = total + weight * loss(result.normal, priors)
-        if weights.stokes and result.is_polarized:
+        if weights.stokes and "specular" in shading.layers:
             total = total + weights.stokes * stokes_loss(result, priors, shading)
     if weights.consistency:
         surface = None if priors is None else priors.surface

@@ -1,4 +1,4 @@
-// From the blended layers to the picture: deferred reflection per pixel, as shading/render.py and directional.py.
+// From the blended layers to the picture: deferred reflection per pixel, as shading/deferred.py and directional.py.
 uniform sampler2D target0, target1, target2, target3, target4;
 uniform mat3 rotation; // world to camera
 uniform mat3 turn;     // of the environment, world to learned axes
@@ -60,7 +60,7 @@ vec3 radiance(vec3 direction, float roughness, vec4 feature) {
 #endif
 
 #ifdef FRESNEL
-const float LEVELS_OF_ROUGHNESS = 4.0; // of shading/roughness.py
+const float LEVELS_OF_ROUGHNESS = 4.0; // of shading/cubemap.py
 uniform float mirror; // GGX's alpha of a roughness of 0
 
 // Radiance from a direction, blurred by so many levels; as cubemap.py.
@@ -81,7 +81,7 @@ vec3 blurred(vec3 direction, float level) {
 #ifdef METAL
 const float LEAST_METAL = 0.01; // of shading/metal.py
 
-// (Rs + Rp) / 2 of a conductor by its reflectance at normal incidence; as optics/conductor.py.
+// (Rs + Rp) / 2 of a conductor by its reflectance at normal incidence; as optics/fresnel.py.
 vec3 conductor(float cosine, vec3 reflectance) {
   vec3 r = clamp(reflectance, 0.1, 0.985), n = 2.1 - 1.9 * r;
   vec3 k2 = ((n + 1.0) * (n + 1.0) * r - (n - 1.0) * (n - 1.0)) / (1.0 - r);
