@@ -36,7 +36,7 @@ class SetLimits:
         determined: largest standard error in degrees at which an estimated angle is reported.
         over_noise: smallest ratio of the polarization's variation over the picture to its noise.
         explained: share of the squared residual above which another angle explains most of a contradiction.
-        moving: share of pixels that this test ignores. They have the largest residuals at the other angle, as motion has.
+        moving: share of pixels that this test ignores: those with the largest residuals at the other angle.
     """
 
     marks = 2.0

@@ -240,8 +240,8 @@ def determined_sets(capture: Capture) -> Iterator[tuple[str, SetSamples]]:
 def strong_polarization(capture: Capture, index: float) -> list[float]:
     """Return the share of pixels with a DoLP above the limit of diffuse light, for each of ``determined_sets``.
 
-    The DoLP has to exceed the limit by three times its noise, which is the residual of the fit. Views with three pictures
-    are left out, because they have no residual. Dark pixels, see ``MEASURABLE``, do not count.
+    The DoLP has to exceed the limit by three times its noise, which is the residual of the fit. Views with three
+    pictures are left out, because they have no residual. Dark pixels, see ``MEASURABLE``, do not count.
 
     Args:
         capture: the capture.
