@@ -27,9 +27,9 @@ from pathlib import Path
 import msgspec
 
 import polarguide
+from polarguide.cli.console import ConsoleReporter
 from polarguide.core.errors import PolarguideError, require
 from polarguide.core.files import make_folder
-from polarguide.core.progress import Reporter
 from polarguide.core.records import read_record
 from polarguide.training.settings import TrainSettings
 from polarguide_bench.options import CompareOptions
@@ -41,18 +41,6 @@ HERE = Path(__file__).resolve().parent
 RECORDS = HERE.parent / "results" / "final"
 PARTS = ("heldout", "four", "bench", "real", "publication", "gnerp", "ablations")
 """Parts in the order of the measurement."""
-
-
-class MessageReporter(Reporter):
-    """Reporter that prints messages without progress."""
-
-    def say(self, text: str) -> None:
-        """Print a message."""
-        print(text, flush=True)
-
-    def warn(self, text: str) -> None:
-        """Print a warning."""
-        print(f"warning: {text}", flush=True)
 
 
 class Part(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -129,7 +117,7 @@ def measure(part: Part, scenes: Path, out: Path, *, jobs: int, threads: int) -> 
         ),
         seeds_of=part.recipes,
         command_line=shlex.join(["python", *sys.argv]),
-        reporter=MessageReporter(),
+        reporter=ConsoleReporter(),
     )
 
 

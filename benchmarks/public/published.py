@@ -17,9 +17,9 @@ from pathlib import Path
 
 import polarguide
 from polarguide.capture.datasets.readers import detect_dataset
+from polarguide.cli.console import ConsoleReporter
 from polarguide.core.errors import PolarguideError, require
 from polarguide.core.files import write_text
-from polarguide.core.progress import Reporter
 from polarguide_bench.join import LAYOUTS, measured_section, published_section
 from polarguide_bench.results import Results
 from polarguide_bench.tables import Section, readable
@@ -68,18 +68,6 @@ PUBLISHED_DATASETS = {
     "neisf": PublishedDataset("NeISF (Li et al. 2024, arXiv:2311.13187)", 1, notes=(_UNRECORDED,)),
 }
 """Published datasets by the name of their format."""
-
-
-class PrintingReporter(Reporter):
-    """Reporter that prints messages and warnings."""
-
-    def say(self, text: str) -> None:
-        """Print a result."""
-        print(text, flush=True)
-
-    def warn(self, text: str) -> None:
-        """Print a warning."""
-        print(f"warning: {text}", flush=True)
 
 
 def find_captures(folder: Path, name: str) -> list[Path]:
@@ -188,7 +176,7 @@ def main() -> None:
     options = parsed()
     check_recipes(options.recipes)
     dataset = PUBLISHED_DATASETS[options.dataset]
-    reporter = PrintingReporter()
+    reporter = ConsoleReporter()
     scenes = []
     for capture in find_captures(options.folder, options.dataset):
         scenes.append(options.out / "scenes" / capture.resolve().name)

@@ -175,6 +175,11 @@ class _Prediction(AngleEstimate):
         """True if the estimated angle explains most of the differences, unlike for motion or stray light."""
         return self.explained > SetLimits.explained
 
+    @property
+    def is_credible(self) -> bool:
+        """True if the estimated angle agrees with the stated one, or explains most of the differences."""
+        return self.agrees or self.explains
+
 
 def chosen_pixels(samples: SetSamples) -> tuple[NDArray[Any], NDArray[Any]]:
     """Return the row indices and the column indices of pixels that are usable in every picture.
@@ -232,10 +237,8 @@ def judge(samples: SetSamples, gray: Floats) -> SetJudgment:
             label=samples.labels[k],
             angle=samples.exposures[k].angle or 0.0,
             gain=samples.exposures[k].gain,
-            looks_like=round(fit.angle, 1)
-            if fit.angle is not None and (fit.agrees or fit.explains)
-            else None,
-            error=fit.error if fit.angle is not None and (fit.agrees or fit.explains) else None,
+            looks_like=round(fit.angle, 1) if fit.angle is not None and fit.is_credible else None,
+            error=fit.error if fit.angle is not None and fit.is_credible else None,
             residual=fit.residual,
             left_out=not used[k],
         )
