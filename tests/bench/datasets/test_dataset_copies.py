@@ -27,11 +27,11 @@ from polarguide.capture.angle_evidence import OutlineAgreement, outline_agreemen
 from polarguide.capture.calibration import Calibration
 from polarguide.capture.formats.pictures import read_mask
 from polarguide.core.errors import PolarguideWarning
-from polarguide.preparation.datasets import detect_dataset
+from polarguide.preparation.datasets import LAYOUTS, detect_dataset
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import PrepareSettings
 from polarguide_bench.datasets.dataset import Dataset
-from polarguide_bench.datasets.readers import open_dataset
+from polarguide_bench.datasets.readers import READERS, open_dataset
 from polarguide_bench.datasets.sources import StokesSource
 
 Change = Callable[[Path], object]
@@ -137,6 +137,10 @@ def changed(root: Path, name: str, changes: tuple[Change, ...]) -> Dataset:
     kind = detect_dataset(root)
     assert kind == name
     return open_dataset(root, kind)
+
+
+def test_every_reader_has_a_layout() -> None:
+    assert {*LAYOUTS, "pandora"} == READERS.keys()
 
 
 @pytest.mark.parametrize("case", CASES)
