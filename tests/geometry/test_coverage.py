@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from reference_rasterizer import rasterize_reference
 from torch import Tensor
 
 from polarguide.geometry.camera import Camera, look_at
@@ -13,7 +14,7 @@ from polarguide.geometry.coverage import (
     depth_map_of_rendering,
     depth_map_of_truth,
 )
-from polarguide.raster import Splats, rasterize_reference
+from polarguide.raster import Splats
 from polarguide.raster.surface import alpha_in_front
 
 SIZE = 48

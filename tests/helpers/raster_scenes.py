@@ -3,11 +3,12 @@
 from typing import NamedTuple
 
 import torch
+from reference_rasterizer import rasterize_reference
 from torch import Tensor
 
 from polarguide.gaussians.geometry import quaternions_to_rotations
 from polarguide.geometry.camera import Camera
-from polarguide.raster import Rasterize, ScreenStatistic, Splats, rasterize_reference
+from polarguide.raster import Rasterize, ScreenStatistic, Splats
 from polarguide.raster.interface import MINIMUM_ALPHA
 
 

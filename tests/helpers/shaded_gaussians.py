@@ -4,10 +4,10 @@ from collections.abc import Callable, Sequence
 
 import torch
 from instruction_sets import selected
+from reference_rasterizer import rasterize_reference
 from torch import Tensor
 
 from polarguide.geometry.camera import Camera
-from polarguide.raster import rasterize_reference
 from polarguide.raster.cpu import rasterize_cpu
 from polarguide.shading.deferred import DeferredShading
 from polarguide.shading.gbuffer import RenderRequest, render

@@ -5,13 +5,14 @@ import math
 from pathlib import Path
 
 import torch
+from reference_rasterizer import rasterize_reference
 from torch import Tensor
 
 from polarguide.capture import Scene, View
 from polarguide.geometry.camera import Camera, look_at
 from polarguide.methods.baselines import SHADING_3DGS_DR
 from polarguide.methods.polarguide import RECIPE_POLARGUIDE
-from polarguide.raster import Splats, rasterize_reference
+from polarguide.raster import Splats
 from polarguide.training.recipe import Recipe, Repeat, Stage, Weights
 from polarguide_bench.recipes import release_rates
 

@@ -6,9 +6,10 @@ from typing import Any
 import pytest
 import torch
 from raster_scenes import Outcome, differences, in_view, outcome, posed, same_bits
+from reference_rasterizer import rasterize_reference
 
 from polarguide import _native
-from polarguide.raster import Splats, choose_backend, cpu, rasterize_reference
+from polarguide.raster import Splats, choose_backend, cpu
 from polarguide.raster.cpu import native_rasterizer, rasterize_cpu
 
 # Float32 against float64. Sums over some hundred pixels and some ten layers round off about 1e-6.

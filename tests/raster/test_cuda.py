@@ -10,9 +10,10 @@ import pytest
 import torch
 from faults import Fault
 from raster_scenes import differences, in_view, outcome, posed
+from reference_rasterizer import rasterize_reference
 
 from polarguide import raster
-from polarguide.raster import ScreenStatistic, Splats, choose_backend, cuda, rasterize_reference
+from polarguide.raster import ScreenStatistic, Splats, choose_backend, cuda
 from polarguide.raster.cuda import load_gsplat, rasterize_cuda
 
 TOLERANCE = 2e-5

@@ -13,8 +13,9 @@ from raster_scenes import (
     posed,
     round_gaussian,
 )
+from reference_rasterizer import rasterize_reference
 
-from polarguide.raster import Splats, choose_backend, rasterize_reference
+from polarguide.raster import Splats, choose_backend
 from polarguide.raster.cpu import rasterize_cpu
 from polarguide.raster.cuda import has_gsplat, rasterize_cuda
 from polarguide.raster.surface import surface_picture

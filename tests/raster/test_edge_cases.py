@@ -15,8 +15,9 @@ from raster_scenes import (
     repeated,
     round_gaussian,
 )
+from reference_rasterizer import rasterize_reference
 
-from polarguide.raster import Rasterize, ScreenStatistic, Splats, choose_backend, rasterize_reference
+from polarguide.raster import Rasterize, ScreenStatistic, Splats, choose_backend
 from polarguide.raster.cpu import rasterize_cpu
 from polarguide.raster.interface import BLUR
 

@@ -5,10 +5,11 @@ from collections.abc import Callable
 import pytest
 import torch
 from raster_scenes import looking_ahead, posed
+from reference_rasterizer import rasterize_reference
 from torch import Tensor
 
 from polarguide.geometry.camera import Camera
-from polarguide.raster import ScreenStatistic, Splats, rasterize_reference
+from polarguide.raster import ScreenStatistic, Splats
 
 
 def smooth(camera: Camera, count: int = 4, channels: int = 2) -> Splats:

@@ -5,8 +5,9 @@ import math
 import pytest
 import torch
 from raster_scenes import in_view, looking_ahead, posed
+from reference_rasterizer import rasterize_reference
 
-from polarguide.raster import Rasterize, Splats, rasterize_reference
+from polarguide.raster import Rasterize, Splats
 from polarguide.raster.cpu import rasterize_cpu
 
 BOTH = pytest.mark.parametrize("rasterize", [rasterize_cpu, rasterize_reference], ids=["cpu", "reference"])

@@ -4,11 +4,12 @@ import pytest
 import torch
 from faults import Fault
 from raster_scenes import differences, in_view, looking_ahead, outcome, posed, round_gaussian
+from reference_rasterizer import rasterize_reference
 from slow_surface import surface_reference
 
 from polarguide import _native
 from polarguide.geometry.camera import Camera
-from polarguide.raster import Splats, rasterize_reference
+from polarguide.raster import Splats
 from polarguide.raster.cpu import native_rasterizer, rasterize_cpu
 from polarguide.raster.surface import SurfacePicture, alpha_in_front, surface_picture
 

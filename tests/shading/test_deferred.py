@@ -4,13 +4,14 @@ import math
 
 import pytest
 import torch
+from reference_rasterizer import rasterize_reference
 from torch import Tensor
 from torch.nn.functional import normalize
 
 from polarguide.gaussians.geometry import GRAZING, shortest_axis_normals
 from polarguide.gaussians.harmonics import SH_C0, sh_basis
 from polarguide.geometry.camera import Camera
-from polarguide.raster import Rasterize, ScreenStatistic, rasterize_reference
+from polarguide.raster import Rasterize, ScreenStatistic
 from polarguide.raster.cpu import rasterize_cpu
 from polarguide.shading.deferred import DeferredShading
 from polarguide.shading.gbuffer import RenderRequest, render

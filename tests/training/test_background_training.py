@@ -5,11 +5,12 @@ from dataclasses import replace
 import pytest
 import torch
 from faults import Fault
+from reference_rasterizer import rasterize_reference
 from trainings import CPU, make_trainer, run
 
 from polarguide.capture import Scene
 from polarguide.methods import RECIPES
-from polarguide.raster import Backend, rasterize_reference
+from polarguide.raster import Backend
 from polarguide.shading.gbuffer import RenderRequest, render, splats
 from polarguide.training.callbacks import LEAST_PIXELS, touched_pixels
 from polarguide.training.loop import TrainingLoop

@@ -3,10 +3,10 @@
 import pytest
 import torch
 from raster_scenes import difference
+from reference_rasterizer import rasterize_reference
 from torch import Tensor
 
 from polarguide.geometry.camera import Camera
-from polarguide.raster import rasterize_reference
 from polarguide.raster.cpu import rasterize_cpu
 from polarguide.raster.interface import Rasterize
 from polarguide.shading.gbuffer import RenderRequest, render

@@ -1,4 +1,4 @@
-"""Rasterizers that splat Gaussians with any channels: an interface, a reference implementation, and fast backends."""
+"""Rasterizers that splat Gaussians with any channels: an interface, and backends for CPU and GPU."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from polarguide.core.options import DeviceName
 from polarguide.raster.cpu import rasterize_cpu
 from polarguide.raster.cuda import has_gsplat, load_gsplat, rasterize_cuda
 from polarguide.raster.interface import Backend, Rasterize, Rasterized, ScreenStatistic, Splats
-from polarguide.raster.reference import rasterize_reference
 
 __all__ = [
     "Backend",
@@ -22,7 +21,6 @@ __all__ = [
     "ScreenStatistic",
     "Splats",
     "choose_backend",
-    "rasterize_reference",
     "use_threads",
 ]
 

@@ -110,6 +110,6 @@ def rasterize_cpu(
                 name,
                 "float32 on the CPU",
                 f"{tensor.dtype} on {tensor.device}",
-                "Convert the tensor, or use rasterize_reference.",
+                "Convert the tensor to float32 on the CPU.",
             )
     return Rasterized(*applied(_Rasterize, camera, statistic, still, *splats))
