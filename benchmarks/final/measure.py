@@ -6,11 +6,12 @@ Each JSON file in this folder is a part: scenes, recipes with their numbers of s
 scene folders, in a subfolder if the part names one. SCENES/heldout is the output of benchmarks/heldout/render.py, and
 SCENES/bench is the folder scenes of polarguide bench --render-only.
 
-Each part is a comparison in OUT/PART. Its record is copied to benchmarks/results/final/PART.json after the part, and
-after Ctrl-C. The same command resumes; finished runs are not repeated. To add seeds, change the number in the part and
-repeat the command. The tables are printed by
+The runs of a scene are in OUT/PART/SCENE, and its record is benchmarks/results/final/PART/SCENE.json. The record is
+written after the scene, and after Ctrl-C. The same command resumes. It repeats no recipe whose seeds are all in the
+record, also on another machine without OUT. To add seeds, change the number in the part and repeat the command. A
+record of other code is refused. The tables are printed by
 
-    python benchmarks/accuracy/bench_tables.py benchmarks/results/final/PART.json
+    python benchmarks/accuracy/bench_tables.py benchmarks/results/final/PART/*.json
 
 Times and speeds are measured only with --jobs 1 on a machine without other work.
 """
@@ -18,9 +19,10 @@ Times and speeds are measured only with --jobs 1 on a machine without other work
 from __future__ import annotations
 
 import argparse
+import json
 import shlex
-import shutil
 import sys
+from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -29,17 +31,19 @@ import msgspec
 import polarguide
 from polarguide.cli.console import ConsoleReporter
 from polarguide.core.errors import PolarguideError, require
-from polarguide.core.files import make_folder
+from polarguide.core.files import make_folder, write_text
 from polarguide.core.records import read_record
+from polarguide.results.evaluation.evaluate import code_digest
 from polarguide.training.settings import TrainSettings
+from polarguide_bench.join import join_records
 from polarguide_bench.options import CompareOptions
 from polarguide_bench.recipes import recipe_named
-from polarguide_bench.results import Results
+from polarguide_bench.results import Record, Results, read_results
 from polarguide_bench.verbs import print_results
 
 HERE = Path(__file__).resolve().parent
 RECORDS = HERE.parent / "results" / "final"
-PARTS = ("heldout", "four", "bench", "real", "publication", "gnerp", "ablations")
+PARTS = ("heldout", "four", "bench", "real", "publication", "ablations")
 """Parts in the order of the measurement."""
 
 
@@ -51,6 +55,7 @@ class Part(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         scenes: names of the scene folders.
         steps: steps of each training.
         recipes: number of seeds of each recipe, in the order of the tables.
+        steps_of: steps of recipes for which they differ from ``steps``.
         folder: subfolder of the scenes.
         downscale: factor by which pictures are reduced.
         refractive_index: refractive index of all scenes, or None if each scene has its own.
@@ -61,6 +66,7 @@ class Part(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     scenes: list[str]
     steps: int
     recipes: dict[str, int]
+    steps_of: dict[str, int] = {}
     folder: str = ""
     downscale: int = 1
     refractive_index: float | None = None
@@ -96,29 +102,91 @@ def check_scenes(parts: Iterable[Part], scenes: Path) -> None:
     )
 
 
-def measure(part: Part, scenes: Path, out: Path, *, jobs: int, threads: int) -> Results:
-    """Train and score the runs of a part that are not finished, and return their results.
+def read_finished(path: Path) -> Record | None:
+    """Return the finished runs of a record, or None if there are none.
 
     Raises:
-        PolarguideError: the comparison fails.
+        PolarguideError: the record is invalid, or other code wrote it.
     """
-    return polarguide.compare(
-        [scenes / part.folder / name for name in part.scenes],
-        list(part.recipes),
-        out,
-        settings=TrainSettings(steps=part.steps, refractive_index=part.refractive_index),
-        options=CompareOptions(
-            jobs=jobs,
-            threads=threads,
-            seeds=max(part.recipes.values()),
-            speed=jobs == 1,
-            downscale=part.downscale,
-            against=part.against,
-        ),
-        seeds_of=part.recipes,
-        command_line=shlex.join(["python", *sys.argv]),
-        reporter=ConsoleReporter(),
+    if not path.exists():
+        return None
+    record = read_results(path)
+    require(
+        record.provenance.sources == code_digest(),
+        path,
+        expected=f"a record of this code, whose digest is {code_digest()}",
+        found=f"the digest {record.provenance.sources} of commit {record.provenance.commit}",
+        remedy="Check out that commit, or remove the records to measure again.",
     )
+    runs = [run for run in record.runs if run.state == "done"]
+    return msgspec.structs.replace(record, runs=runs) if runs else None
+
+
+def missing_recipes(part: Part, scene: str, finished: Record | None) -> dict[str, int]:
+    """Return the recipes of a part with fewer finished runs on a scene than seeds, and their numbers of seeds."""
+    runs = [] if finished is None else finished.runs
+    done = Counter(run.recipe for run in runs if run.scene == scene)
+    return {recipe: seeds for recipe, seeds in part.recipes.items() if done[recipe] < seeds}
+
+
+def joined(finished: Record | None, measured: Record, part: Part) -> Record:
+    """Return the runs of a new record, and the finished runs of the other recipes, in the order of the part."""
+    records = {"the measurement": measured}
+    recipes = {run.recipe for run in measured.runs}
+    kept = [] if finished is None else [run for run in finished.runs if run.recipe not in recipes]
+    if finished is not None and kept:
+        records["the earlier record"] = msgspec.structs.replace(finished, runs=kept)
+    known = {run.recipe for record in records.values() for run in record.runs}
+    record = join_records(records, against=part.against if part.against in known else None)
+    order = list(part.recipes)
+    return msgspec.structs.replace(
+        record,
+        recipes=sorted(record.recipes, key=lambda recipe: order.index(recipe.name)),
+        runs=sorted(record.runs, key=lambda run: (order.index(run.recipe), run.seed)),
+    )
+
+
+def measure(part: Part, scene: Path, out: Path, path: Path, *, jobs: int, threads: int) -> Results:
+    """Train and score the runs of a part on a scene that are not in its record, and write the record.
+
+    Args:
+        part: recipes and settings.
+        scene: scene folder.
+        out: folder for the runs.
+        path: record of the scene.
+        jobs: number of simultaneous runs.
+        threads: threads of each run.
+
+    Raises:
+        PolarguideError: the comparison fails, or other code wrote the record.
+    """
+    finished = read_finished(path)
+    missing = missing_recipes(part, scene.name, finished)
+    if finished is not None and not missing:
+        return Results(finished)
+    try:
+        polarguide.compare(
+            [scene],
+            list(missing),
+            out,
+            settings=TrainSettings(steps=part.steps, refractive_index=part.refractive_index),
+            options=CompareOptions(
+                jobs=jobs,
+                threads=threads,
+                seeds=max(missing.values()),
+                speed=jobs == 1,
+                downscale=part.downscale,
+            ),
+            seeds_of=missing,
+            steps_of={name: steps for name, steps in part.steps_of.items() if name in missing},
+            command_line=shlex.join(["python", *sys.argv]),
+            reporter=ConsoleReporter(),
+        )
+    finally:
+        if (out / "results.json").exists():
+            record = joined(finished, read_results(out / "results.json"), part)
+            write_text(path, json.dumps(msgspec.to_builtins(record), indent=1, allow_nan=False) + "\n")
+    return Results(record)
 
 
 def main() -> None:
@@ -138,18 +206,22 @@ def main() -> None:
             for name in options.parts
         }
         check_scenes(parts.values(), options.scenes)
-        make_folder(options.records)
         results = {}
         for name, part in parts.items():
             print(f"{name}: {part.about}", flush=True)
-            out = options.out / name
-            try:
-                results[out] = measure(part, options.scenes, out, jobs=options.jobs, threads=options.threads)
-            finally:
-                if (out / "results.json").exists():
-                    shutil.copyfile(out / "results.json", options.records / f"{name}.json")
-        for out, part_results in results.items():
-            print_results(part_results, out)
+            make_folder(options.records / name)
+            for scene in part.scenes:
+                out = options.out / name / scene
+                results[out] = measure(
+                    part,
+                    options.scenes / part.folder / scene,
+                    out,
+                    options.records / name / f"{scene}.json",
+                    jobs=options.jobs,
+                    threads=options.threads,
+                )
+        for out, scene_results in results.items():
+            print_results(scene_results, out)
     except PolarguideError as error:
         parser.error(str(error))
     except KeyboardInterrupt:

@@ -4,15 +4,27 @@ import json
 import shutil
 import sys
 from pathlib import Path
+from typing import Any
 
 import cv2
+import msgspec
 import numpy as np
 import pytest
 
+import polarguide
 from polarguide.capture import load_scene
 from polarguide.capture.layout import find_layout
 from polarguide.core.errors import PolarguideError
+from polarguide.results.evaluation.evaluate import code_digest
 from polarguide_bench.options import BENCH
+from polarguide_bench.results import (
+    FORMAT,
+    Provenance,
+    RecipeRecord,
+    SceneRecord,
+    Settings,
+    read_results,
+)
 from polarguide_synth.colmap import place_cameras
 from polarguide_synth.settings import find_scene
 
@@ -125,3 +137,64 @@ def test_a_prepared_rendering_has_ground_truth(rendering: Path, demo_scene: Path
         difference = view.photograph() - demo.view(name).photograph()
         assert difference[valid].abs().median() < 0.01
         assert view.ground_truth.normal is not None
+
+
+@pytest.fixture
+def trained(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Recipes that comparisons trained. They only write a record, in which ``3dgs-dr`` is missing the first time."""
+    recipes: list[str] = []
+
+    def compare(scenes: list[Path], names: list[str], out: Path, **options: Any) -> None:
+        (scene,) = scenes
+        runs = []
+        for name in names:
+            for seed in range(options["seeds_of"][name]):
+                done = name != "3dgs-dr" or name in recipes
+                run = {
+                    "scene": scene.name,
+                    "recipe": name,
+                    "seed": seed,
+                    "folder": "",
+                    "error": None,
+                    "views": {},
+                }
+                state = "done" if done else "missing"
+                metrics = {"psnr": 30.0 + seed} if done else None
+                runs.append({**run, "state": state, "metrics": metrics, "lpips_reason": None})
+        recipes.extend(names)
+        settings = Settings(options["settings"].steps, 1, 1, "srgb", None, 1, 1)
+        record = {
+            "format": FORMAT,
+            "provenance": Provenance("0.2", None, code_digest(), "", ""),
+            "settings": settings,
+            "scenes": [SceneRecord(scene.name, "0", 3, ["v"])],
+            "recipes": [RecipeRecord(name, "", {}) for name in names],
+            "runs": runs,
+        }
+        out.mkdir()
+        (out / "results.json").write_bytes(msgspec.json.encode(record))
+
+    monkeypatch.setattr(polarguide, "compare", compare)
+    return recipes
+
+
+def test_a_recorded_recipe_is_not_trained_again(trained: list[str], tmp_path: Path) -> None:
+    path = tmp_path / "record.json"
+
+    def finished(out: str, recipes: dict[str, int]) -> list[tuple[str, int]]:
+        part = measure.Part("", ["s"], 2, recipes, against="polgs")
+        record = measure.measure(part, tmp_path / "s", tmp_path / out, path, jobs=2, threads=1).record
+        assert record == read_results(path)
+        assert record.settings.against == ("polgs" if "polgs" in recipes else None)
+        return [(run.recipe, run.seed) for run in record.runs if run.state == "done"]
+
+    assert finished("1", {"3dgs": 1, "3dgs-dr": 1}) == [("3dgs", 0)]
+    both = {"3dgs-dr": 1, "3dgs": 1}
+    assert finished("2", both) == [("3dgs-dr", 0), ("3dgs", 0)]
+    more = {"polgs": 1, "3dgs": 2, "3dgs-dr": 1}
+    assert finished("3", more) == [("polgs", 0), ("3dgs", 0), ("3dgs", 1), ("3dgs-dr", 0)]
+    assert finished("4", more) == [("polgs", 0), ("3dgs", 0), ("3dgs", 1), ("3dgs-dr", 0)]
+    assert trained == ["3dgs", "3dgs-dr", "3dgs-dr", "polgs", "3dgs"]
+    path.write_text(path.read_text().replace(code_digest(), "0" * 16))
+    with pytest.raises(PolarguideError, match="digest 0000000000000000"):
+        finished("5", more)

@@ -155,17 +155,26 @@ def test_saturated_and_dark_samples() -> None:
     levels = estimate_levels(255, 255, 8, bits=None, black=10.0, saturation=250)
     values = np.full((4, 4), 100, np.uint8)
     values[0, 0], values[0, 1] = 250, 249
-    values[2:, 2:] = 10  # a cell without light
-    values[2, 0] = 10  # a single angle without light is what Brewster's angle gives
-    values[3, 1] = 0  # cut off below black
+    values[2:, 2:] = [[10, 9], [9, 10]]  # a cell without light, with noise
+    values[3, 1] = 0  # clipped below the black level
     saturated, dark = unusable_samples(values, levels)
     assert np.argwhere(saturated).tolist() == [[0, 0]]
-    assert np.argwhere(dark).tolist() == [[2, 2], [2, 3], [3, 1], [3, 2], [3, 3]]
+    assert np.argwhere(dark).tolist() == [[3, 1]]
     frame = np.full((4, 4), 10, np.float32)
     frame[0, 2:] = 100
-    frame[1, 2:] = 100
-    assert unusable_samples(values, levels, frame)[1][:2, 2:].all()
+    assert np.argwhere(unusable_samples(values, levels, frame)[1]).tolist() == [[3, 1]]
     assert levels.linear(values, frame)[0, 2] == 0.0
+
+
+def test_zeros_without_a_black_level_are_dark_if_their_cell_is() -> None:
+    levels = estimate_levels(255, 255, 8, bits=None, black=0.0, saturation=250)
+    values = np.full((4, 4), 100, np.uint8)
+    values[2:, 2:] = 0
+    values[0, 1] = 0  # a single angle without light: Brewster's angle
+    cell = [[2, 2], [2, 3], [3, 2], [3, 3]]
+    assert np.argwhere(unusable_samples(values, levels)[1]).tolist() == cell
+    frame = np.zeros((4, 4), np.float32)
+    assert np.argwhere(unusable_samples(values, levels, frame)[1]).tolist() == cell
 
 
 def codes(light: np.ndarray, pattern: tuple[str, ...], noise: float = 0.0) -> np.ndarray:

@@ -23,6 +23,7 @@ from polarguide.capture.exposures import FOUR, Exposure
 from polarguide.results.evaluation import evaluate
 from polarguide.results.evaluation.evaluate import (
     COMMIT,
+    NOT_SCORING,
     NOT_TRAINING,
     code_digest,
     commit,
@@ -227,6 +228,9 @@ ROOT = Path(__file__).resolve().parents[3]
         ("optics/a.py", "second = 2", (True, True)),
         ("optics/a.py", '"""Other words."""\nfirst = 1  # and a comment', (False, False)),
         ("results/a.py", "second = 2", (True, False)),
+        ("viewer/a.py", "second = 2", (False, False)),
+        ("../polarguide_bench/polgs.py", "second = 2", (True, True)),
+        ("../polarguide_bench/tables.py", "second = 2", (False, False)),
         ("_native.so", "second", (True, True)),
         ("new.py", "", (True, True)),
         ("_native.pyi", "second", (False, False)),
@@ -236,7 +240,9 @@ ROOT = Path(__file__).resolve().parents[3]
 def test_code_counts_and_scoring_repeats_no_training(
     tmp_path: Path, name: str, text: str, changes: tuple[bool, bool]
 ) -> None:
-    for file in ("optics/a.py", "results/a.py", "_native.so", "_native.pyi", "data/picture.png"):
+    (tmp_path / "polarguide_bench").mkdir()
+    files = ("optics/a.py", "results/a.py", "viewer/a.py", "_native.so", "_native.pyi", "data/picture.png")
+    for file in files:
         (tmp_path / "polarguide" / file).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / "polarguide" / file).write_text("first = 1")
 
@@ -250,9 +256,15 @@ def test_code_counts_and_scoring_repeats_no_training(
     assert {len(digest) for digest in before} == {16}
 
 
-def test_a_training_reaches_none_of_the_rooms_that_its_digest_leaves_out() -> None:
-    left_out = {f"polarguide.{name.removesuffix('.py')}" for name in NOT_TRAINING}
-    code = "import sys, polarguide.runs.train; print(*sys.modules)"
+@pytest.mark.parametrize(
+    ("module", "names"),
+    [("polarguide.runs.train", NOT_TRAINING), ("polarguide.results.evaluation.evaluate", NOT_SCORING)],
+)
+def test_training_and_scoring_import_no_code_outside_of_their_digest(
+    module: str, names: tuple[str, ...]
+) -> None:
+    left_out = {f"polarguide.{name.removesuffix('.py')}" for name in names}
+    code = f"import sys, {module}; print(*sys.modules)"
     loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert "polarguide.training.loop" in loaded.split()
     assert not {".".join(name.split(".")[:2]) for name in loaded.split()} & left_out

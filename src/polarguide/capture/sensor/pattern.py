@@ -385,8 +385,9 @@ def unusable_samples(
     """Find the saturated and the dark samples of a mosaic. The mosaic must start with a whole polarizer cell.
 
     A sample is saturated if its value is at least ``levels.saturation``. It is dark if it is clipped at 0 below the
-    black level. All samples of a 2 x 2 cell are dark if none of them exceeds the black level, because there is no light
-    with a polarization. A single black sample in a brighter cell is valid: a surface at Brewster's angle looks so.
+    black level. All samples of a 2 x 2 cell of zeros are dark, because nothing was measured. A single zero in a
+    brighter cell is valid: a surface at Brewster's angle looks so. Samples near a black level measure that there is
+    hardly any light, so they are valid.
 
     Args:
         values: stored values [H, W]; H and W are even.
@@ -397,11 +398,11 @@ def unusable_samples(
         The mask of saturated samples, and the mask of dark samples, [H, W] each.
     """
     height, width = values.shape
+    zero = values == 0
+    cells = zero.reshape(height // 2, 2, width // 2, 2).all(axis=(1, 3))
+    black = np.repeat(np.repeat(cells, 2, axis=0), 2, axis=1)
     floor = np.float32(levels.black) if dark is None else dark
-    lit = (values > floor).reshape(height // 2, 2, width // 2, 2).any(axis=(1, 3))
-    black = np.repeat(np.repeat(~lit, 2, axis=0), 2, axis=1)
-    if levels.black > 0 or dark is not None:
-        black |= (values == 0) & (floor > 0)
+    black |= zero & (floor > 0)
     return np.asarray(values >= levels.saturation), black
 
 

@@ -70,17 +70,19 @@ PACKAGE = Path(__file__).parents[2]
 COMMIT = "_commit.txt"
 """File in an installed package that contains the commit of its build. It is empty if the commit is unknown."""
 DIGITS = 16
-NOT_TRAINING = ("results", "inspection", "viewer", "api", "cli", "__main__.py")
+NOT_SCORING = ("inspection", "viewer", "api", "cli", "__main__.py")
+"""Parts of the package that neither training nor scoring imports."""
+NOT_TRAINING = ("results", *NOT_SCORING)
 """Parts of the package that training never imports."""
 BENCH = "polarguide_bench"
 """Neighboring package with the recipes of comparisons."""
-BENCH_TRAINING = ("recipes.py", "gnerp")
-"""Parts of the bench that training imports."""
+BENCH_METHODS = ("recipes.py", "polgs.py", "gnerp")
+"""Parts of the bench that train and score. The other parts plan runs and write tables."""
 
 
 @lru_cache
 def code_digest(package: Path = PACKAGE, *, training: bool = False) -> str:
-    """Hash the code of the package and the compiled library to 16 hexadecimal digits.
+    """Hash the code that trains and scores, and the compiled library, to 16 hexadecimal digits.
 
     Comments and docstrings do not change the digest.
 
@@ -89,14 +91,12 @@ def code_digest(package: Path = PACKAGE, *, training: bool = False) -> str:
         training: hash only code that training imports, so that a change of the scoring does not invalidate trained
             runs.
     """
-    compiled = [path for path in package.glob("_native.*") if path.suffix != ".pyi"]
+    left_out = NOT_TRAINING if training else NOT_SCORING
+    sources = [path for path in package.rglob("*.py") if path.relative_to(package).parts[0] not in left_out]
     bench = package.with_name(BENCH)
-    sources = [*package.rglob("*.py")]
-    neighbors = [*bench.rglob("*.py")]
-    if training:
-        sources = [path for path in sources if path.relative_to(package).parts[0] not in NOT_TRAINING]
-        neighbors = [path for path in neighbors if path.relative_to(bench).parts[0] in BENCH_TRAINING]
-    return _digest(package.parent, [*sources, *neighbors, *compiled])
+    methods = [path for path in bench.rglob("*.py") if path.relative_to(bench).parts[0] in BENCH_METHODS]
+    compiled = [path for path in package.glob("_native.*") if path.suffix != ".pyi"]
+    return _digest(package.parent, [*sources, *methods, *compiled])
 
 
 def _digest(folder: Path, files: Sequence[Path]) -> str:
