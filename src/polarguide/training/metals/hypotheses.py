@@ -67,7 +67,7 @@ LEAST_SPREAD = 1e-3
 
 
 class Setting(NamedTuple):
-    """What all surfaces of a scene share.
+    """Values that all surfaces of a scene share.
 
     Attributes:
         refractive_index: refractive index of dielectrics.
