@@ -52,7 +52,6 @@ def turning_samples(seed: int) -> ViewSamples:
         across=over * specular - under * diffuse + noise,
         oblique=torch.zeros(VIEWS, SURFACES, 3).double(),
         cosine=cosine,
-        mixture=torch.zeros(VIEWS, SURFACES).double(),
         normal=normal,
     )
 
@@ -163,13 +162,13 @@ def test_errors_below_the_noise_of_a_camera_count_as_this_noise() -> None:
     assert prior.scale == pytest.approx(NOISE, rel=0.05)
 
 
-def ratio_of(dielectric: Tensor, metal: Tensor, views: Tensor, mixed: Tensor | None = None) -> Tensor:
+def ratio_of(dielectric: Tensor, metal: Tensor, views: Tensor) -> Tensor:
     """Log likelihood ratio [N] of surfaces that show one normal in all views."""
     count = len(metal)
     zeros = torch.zeros(count)
     terms = DielectricTerms(dielectric, torch.zeros(count, 3, 3, 3), torch.zeros(count, 3, 3), zeros, zeros)
     none = torch.zeros(count, 0, dtype=torch.int64)
-    return log_ratio(metal, terms, views, zeros if mixed is None else mixed, none)
+    return log_ratio(metal, terms, views, none)
 
 
 def test_large_errors_of_other_surfaces_do_not_hide_a_metal() -> None:
@@ -179,35 +178,6 @@ def test_large_errors_of_other_surfaces_do_not_hide_a_metal() -> None:
     ratio = ratio_of(dielectric, metal, torch.full((801,), 5.0))
     assert float(ratio[-1]) > 10 * RULES.prior
     assert float(ratio[:-1].max()) < 0
-
-
-def test_mixtures_of_normals_reduce_evidence_and_never_reverse_it() -> None:
-    """A small error of the metal is evidence in pure pixels only."""
-    others = torch.logspace(-4, -2, 100)
-    dielectric = torch.cat((torch.tensor([6e-4] * 3 + [1e-4] * 3), others))
-    metal = torch.cat((torch.tensor([1e-4] * 3 + [6e-4] * 3), others))
-    mixed = torch.cat((torch.tensor([0.0, 1e-3, 1.0] * 2), torch.zeros(100)))
-    ratio = ratio_of(dielectric, metal, torch.full((106,), 5.0), mixed)
-    assert float(ratio[0]) > 10 * RULES.prior
-    assert 0 < float(ratio[1]) < 5 * RULES.prior
-    assert 0 < float(ratio[2]) < 5e-3
-    torch.testing.assert_close(ratio[3:6], -ratio[:3])
-
-
-def test_thin_objects_mix_normals() -> None:
-    """A ball is thin where it is as small as a pixel: its normals then point to all sides of a view."""
-    ball = gaussians_of_the_ball()
-    view = views_of("gray", 0.0)[0]
-    tiny = {name: values.clone() for name, values in ball.items()}
-    tiny["means"] *= 0.05
-    tiny["log_scales"] += math.log(0.05)
-    mixtures = []
-    for gaussians in (ball, tiny):
-        sums = view_sums(gaussians, view, rasterize_cpu, LIMITS.least_normal)
-        samples = samples_of([sums], slice(None), LIMITS)
-        mixtures.append(float((samples.weight * samples.mixture).sum() / samples.weight.sum()))
-    assert mixtures[0] < 0.1
-    assert mixtures[1] > 3 * mixtures[0]
 
 
 def test_each_gaussian_gets_the_normals_of_its_pixels() -> None:

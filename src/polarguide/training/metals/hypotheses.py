@@ -25,10 +25,6 @@ variance differs between surfaces, because it includes the errors of the rendere
 chi-square distribution with scale ``s^2`` and weight ``d0``, both estimated from all surfaces of the scene. With the
 variance integrated out, the log likelihood ratio is ``(d0 + d)/2 log((d0 s^2 + d E_dielectric) / (d0 s^2 + d
 E_metal))`` (Smyth 2004, "Linear models and empirical Bayes methods", Statistical Applications in Genetics 3).
-
-**Thin objects.** Their pixels blend normals of different directions. Neither hypothesis predicts the polarization of a
-mixture, so that a small error is no evidence there. Both errors get the additional variance ``MIXED m^2``, where ``m =
-1 - R^2`` is the mixture of normals in pixels with blended normals of length R.
 """
 
 from __future__ import annotations
@@ -60,8 +56,6 @@ UNKNOWNS = 2
 """Number of unknowns of each hypothesis. As many views are needed to determine the unknowns, and give no evidence."""
 NOISE = 1e-4
 """Mean square of the noise of a camera relative to the light. Smaller errors count as this error in the prior."""
-MIXED = 0.005
-"""Error variance of the degree of polarization in a pixel that blends normals of all directions."""
 LEAST_SPREAD = 1e-3
 """Least variance of the logarithms of error variances. It limits the weight of the prior to 2,000 observations."""
 
@@ -281,9 +275,7 @@ def variance_prior(errors: Tensor, observations: Tensor) -> VariancePrior:
     return VariancePrior(scale, weight)
 
 
-def log_ratio(
-    metal: Tensor, terms: DielectricTerms, views: Tensor, mixed: Tensor, neighbors: Tensor
-) -> Tensor:
+def log_ratio(metal: Tensor, terms: DielectricTerms, views: Tensor, neighbors: Tensor) -> Tensor:
     """Return the log likelihood ratio [N] of metal and dielectric.
 
     It is 0 in scenes without a surface that has at least one independent view.
@@ -292,7 +284,6 @@ def log_ratio(
         metal: [N] error of the metal hypothesis.
         terms: error of the dielectric hypothesis.
         views: [N] number of independent views, beyond those that determine the unknowns.
-        mixed: [N] additional variance of pixels that blend different normals.
         neighbors: [N, K] indices of the neighbors.
     """
     sampled = views >= 1
@@ -301,6 +292,6 @@ def log_ratio(
     observations = 2 * views.clamp(min=1e-6)
     smaller = torch.minimum(terms.error(), metal)
     prior = variance_prior(smaller[sampled], observations[sampled])
-    noise = prior.noise(observations, mixed + smaller)
+    noise = prior.noise(observations, smaller)
     dielectric = dielectric_fit(terms, noise, neighbors)
-    return prior.ratio(observations, mixed + dielectric.error, mixed + metal) + dielectric.freedom
+    return prior.ratio(observations, dielectric.error, metal) + dielectric.freedom

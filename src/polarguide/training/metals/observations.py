@@ -36,8 +36,6 @@ class ViewSamples(NamedTuple):
         across: [V, N, 3] mean polarization P across the plane of incidence.
         oblique: [V, N, 3] mean polarization at 45 degrees to that plane.
         cosine: [V, N] mean cosine of the zenith angle.
-        mixture: [V, N] mean of ``1 - R^2`` with the length R of the blended normal. It is 0 in pixels with a single
-            normal, and 1 in pixels with all directions.
         normal: [V, N, 3] mean rendered normal, in world axes.
     """
 
@@ -46,7 +44,6 @@ class ViewSamples(NamedTuple):
     across: Tensor
     oblique: Tensor
     cosine: Tensor
-    mixture: Tensor
     normal: Tensor
 
 
@@ -66,10 +63,10 @@ def shares(gaussians: Parameters, camera: Camera, target: Tensor, rasterize: Ras
 
 
 def view_sums(gaussians: Parameters, view: View, rasterize: Rasterize, least_normal: float) -> Tensor:
-    """Return sums [N, 15] over the pixels of each Gaussian in a view, which has to determine the Stokes vector.
+    """Return sums [N, 14] over the pixels of each Gaussian in a view, which has to determine the Stokes vector.
 
     ``samples_of`` converts these sums to means. The columns are 1, S0 (three colors), P (three), the polarization at 45
-    degrees (three), the cosine of the zenith, the mixture of normals, and the normal in world axes (three).
+    degrees (three), the cosine of the zenith, and the normal in world axes (three).
     """
     device = gaussians["means"].device
     normal = render(gaussians, view.camera, rasterize, RenderRequest(sh_degree=0)).normal
@@ -88,8 +85,7 @@ def view_sums(gaussians: Parameters, view: View, rasterize: Rasterize, least_nor
     one = torch.ones_like(x)[..., None]
     good = (reliable & ~(view.invalid | view.saturated))[..., None]
     cosine = -dot(guide, rays)[..., None]
-    mixture = (1 - dot(normal, normal))[..., None].clamp(min=0)
-    columns = (one, s0, across, oblique, cosine, mixture, view.camera.to_world(guide))
+    columns = (one, s0, across, oblique, cosine, view.camera.to_world(guide))
     target = torch.cat(columns, dim=-1) * good
     return shares(gaussians, view.camera, target.contiguous(), rasterize)
 
@@ -108,8 +104,7 @@ def samples_of(looks: Sequence[Tensor], which: slice, limits: MetalViews) -> Vie
         across=means[..., 3:6],
         oblique=means[..., 6:9],
         cosine=cosine,
-        mixture=means[..., 10],
-        normal=means[..., 11:14],
+        normal=means[..., 10:13],
     )
 
 

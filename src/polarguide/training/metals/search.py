@@ -42,7 +42,6 @@ from polarguide.shading.metal import FIRST_REFLECTANCE, become_metal
 from polarguide.shading.model import Light, Parameters, ShadingModel, radiance_cubemap
 from polarguide.training.context import TrainingContext, TrainingState
 from polarguide.training.metals.hypotheses import (
-    MIXED,
     UNKNOWNS,
     DielectricTerms,
     Setting,
@@ -130,14 +129,13 @@ def of_views(
         total = samples.weight.sum(dim=0)
         count = total * total / (samples.weight**2).sum(dim=0).clamp(min=1e-9) * (total > LEAST_PIXELS)
         color = (samples.weight[..., None] * samples.s0).sum(dim=0) / total.clamp(min=1e-6)[:, None]
-        mixture = (samples.weight * samples.mixture).sum(dim=0) / total.clamp(min=1e-6)
         terms = dielectric_terms(samples, setting)
-        parts.append((*metal_fit(samples, setting), count, color, total, mixture, *terms))
-    metal, reflectance, count, color, total, mixture, *columns = (
+        parts.append((*metal_fit(samples, setting), count, color, total, *terms))
+    metal, reflectance, count, color, total, *columns = (
         torch.cat(values) for values in zip(*parts, strict=True)
     )
     views = (count - UNKNOWNS).clamp(min=0)
-    nats = log_ratio(metal, DielectricTerms(*columns), views, MIXED * mixture**2, neighbors)
+    nats = log_ratio(metal, DielectricTerms(*columns), views, neighbors)
     ratio = nats / views.clamp(min=1e-6) - _tint_cost(color, total, rules)
     return MetalEvidence(ratio, views, reflectance, color.clamp(min=0), labels)
 
