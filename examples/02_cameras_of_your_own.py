@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 
 import polarguide
-from polarguide.geometry.scene_frame import orbit
+from polarguide.geometry.camera_path import orbit
 from polarguide.visualization.figures import normal_to_rgb, radiance_to_rgb, write_png
 
 run, out = polarguide.open_run(sys.argv[1]), Path(sys.argv[2])

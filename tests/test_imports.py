@@ -51,6 +51,7 @@ ROOMS = (
     "polarguide_shots.verbs",
     "polarguide_synth",
     "polarguide_synth.verbs",
+    "polarguide_bench.datasets",
     "polarguide_bench.gnerp",
     "polarguide_bench",
     "polarguide_bench.verbs",

@@ -31,7 +31,8 @@ from torch import Tensor
 
 import polarguide
 from polarguide.capture import Scene
-from polarguide.geometry.camera import Camera, dot, unit
+from polarguide.geometry.camera import Camera
+from polarguide.geometry.vectors import dot, unit
 from polarguide.methods import recipe_named
 from polarguide.training.losses import Weights, term
 from polarguide.training.recipe import Recipe

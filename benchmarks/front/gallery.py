@@ -25,7 +25,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 import polarguide as pg
 from polarguide.core.files import write_text
-from polarguide.geometry.scene_frame import orbit
+from polarguide.geometry.camera_path import orbit
 from polarguide.results.export.placement import Presented
 from polarguide.results.rendering.relight import write_hdr
 from polarguide.visualization.figures import (

@@ -16,10 +16,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import polarguide
-from polarguide.capture.datasets.readers import detect_dataset
 from polarguide.cli.console import ConsoleReporter
 from polarguide.core.errors import PolarguideError, require
 from polarguide.core.files import write_text
+from polarguide.preparation.datasets import detect_dataset
 from polarguide_bench.join import LAYOUTS, measured_section, published_section
 from polarguide_bench.results import Results
 from polarguide_bench.tables import Section, readable

@@ -21,7 +21,8 @@ import torch
 
 from polarguide import open_run
 from polarguide.gaussians.gaussians import Gaussians
-from polarguide.geometry.scene_frame import orbit, scene_frame
+from polarguide.geometry.camera_path import orbit
+from polarguide.geometry.scene_frame import scene_frame
 from polarguide.shading.result import LAYERS
 from polarguide.viewer import run_scenery
 from polarguide.viewer.scenery import Appearance, Painter

@@ -1,1 +1,1 @@
-"""Comparisons of recipes with tables and reports, batch processing of captures, ablations, and the baseline GNeRP."""
+"""Comparisons of recipes with reports, batch processing, ablations, the baseline GNeRP, and readers of datasets."""

@@ -27,7 +27,8 @@ from torch.nn.functional import pad
 
 from polarguide.gaussians.gaussians import Parameters
 from polarguide.gaussians.harmonics import evaluate_sh
-from polarguide.geometry.camera import Camera, dot, unit
+from polarguide.geometry.camera import Camera
+from polarguide.geometry.vectors import dot, unit
 from polarguide.methods.baselines import RATES
 from polarguide.methods.polarguide import BEHIND
 from polarguide.shading.cubemap import cubemap_lookup

@@ -64,13 +64,12 @@ def measure(
         )
     reading = replace(reading, calibration=angles.read(), analyzers=angles.analyzers())
     heard = partial(_print_entry, every=watching.watch is not None)
+    line = importlib.import_module("polarguide_shots.measurement.line")
     if watching.watch is None:
-        line = importlib.import_module("polarguide_shots.measurement.line")
         outcome = line.measure_shots(paths, out, options, reading, heard=heard, reporter=ConsoleReporter())
     else:
-        watch = importlib.import_module("polarguide_shots.measurement.line")
         with StopSignals() as should_stop:
-            outcome = watch.watch_folder(
+            outcome = line.watch_folder(
                 watching.watch, out, options, reading, watching,
                 should_stop=should_stop, heard=heard, reporter=ConsoleReporter(),
             )  # fmt: skip

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from polarguide.core.errors import PolarguideError, require
 from polarguide.core.files import make_folder, write_whole
 from polarguide.core.records import decode
-from polarguide.geometry.camera import unit_array as unit
+from polarguide.geometry.vectors import unit_array as unit
 from polarguide_synth.mesh import Array, Mesh, grid_faces, joined, rotation, smooth_normals, solid, write_ply
 from polarguide_synth.schema import (
     REMEDY,

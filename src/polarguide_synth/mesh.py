@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polarguide.core.files import write_whole
-from polarguide.geometry.camera import unit_array as unit
+from polarguide.geometry.vectors import unit_array as unit
 
 Array = NDArray[np.float64]
 

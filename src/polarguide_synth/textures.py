@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from polarguide.core.errors import PolarguideError
-from polarguide.geometry.camera import unit_array as unit
+from polarguide.geometry.vectors import unit_array as unit
 from polarguide.optics.color import srgb_decode_array
 from polarguide_synth.mesh import Array
 from polarguide_synth.schema import make

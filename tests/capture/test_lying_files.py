@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 from faults import Fault
 
-from polarguide.capture.datasets.readers import open_dataset
 from polarguide.capture.formats.pictures import decode_arrays, read_array, read_arrays, read_radiance
 from polarguide.capture.formats.stored import declared_size, decode_stored, find_damage
 from polarguide.capture.metadata import objects_of
@@ -155,21 +154,3 @@ def test_focal_lengths_of_nerfstudio_are_positive(tmp_path: Path) -> None:
     Fault(expected="a positive focal length fl_y").raised_by(
         read_pose_file, tmp_path / "transforms.json", ["v0"], lambda _: ((32, 24),)
     )
-
-
-@pytest.mark.parametrize(
-    ("key", "value", "fault"),
-    [
-        ("image_width", np.array([64, 64]), Fault(expected="in shape")),
-        ("image_width", np.inf, Fault(found="not finite")),
-        ("image_height", -48, Fault(expected="a size in pixels")),
-        ("extrinsics", np.full((4, 4, 4), np.nan), Fault(found="not finite")),
-        ("extrinsics", np.full((4, 4, 4), "x"), Fault(expected="complete .npz")),
-    ],
-)
-def test_cameras_of_phygap(tmp_path: Path, key: str, value: object, fault: Fault) -> None:
-    (tmp_path / "images_full").mkdir()
-    (tmp_path / "images_full" / "000.exr").touch()
-    whole = {"intrinsics": np.diag([90.0, 90, 1]), "extrinsics": np.stack([np.eye(4)]), "image_width": 64}
-    np.savez(tmp_path / "camera_params.npz", **{**whole, "image_height": 48, key: value})
-    fault.raised_by(open_dataset, tmp_path, "phygap", transfer="auto")

@@ -24,7 +24,7 @@ from polarguide.core import errors
 from polarguide.core.errors import PolarguideWarning, install_package
 from polarguide.gaussians.ply import read_ply
 from polarguide.geometry.camera import seen_at
-from polarguide.geometry.scene_frame import camera_record
+from polarguide.geometry.camera_path import camera_record
 from polarguide.results.rendering.mesh import subject_of
 from polarguide.results.rendering.pictures import path_cameras
 from polarguide.runs.folder import CHECKPOINT, CONFIGURATION

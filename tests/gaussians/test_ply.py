@@ -9,7 +9,7 @@ from faults import Fault
 from plyfile import PlyData
 
 from polarguide.gaussians.ply import read_ply, refit_sh, write_ply
-from polarguide.geometry.camera import spread_directions
+from polarguide.geometry.vectors import spread_directions
 
 COUNT = 7
 SHAPES = {

@@ -15,8 +15,9 @@ from polarguide import optics
 from polarguide.capture import view
 from polarguide.gaussians.geometry import quaternions_to_rotations
 from polarguide.geometry.camera import Camera, look_at, quaternion
+from polarguide.geometry.camera_path import camera_record, interpolated, orbit, read_path
 from polarguide.geometry.polarizer import ANGLES, four_intensities, malus, stokes_of_four
-from polarguide.geometry.scene_frame import camera_record, interpolated, orbit, read_path, scene_frame
+from polarguide.geometry.scene_frame import scene_frame
 
 EYE = torch.eye(3, dtype=torch.float64)
 LENS = Camera(64, 48, 70.0, 70.0, 32.0, 24.0, EYE, EYE[0])

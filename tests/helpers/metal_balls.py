@@ -8,8 +8,8 @@ from torch import Tensor
 
 from polarguide import optics
 from polarguide.capture import View
-from polarguide.geometry.camera import spread_directions
 from polarguide.geometry.polarizer import ANGLES
+from polarguide.geometry.vectors import spread_directions
 
 METALS = {"gold": (0.95, 0.78, 0.37), "aluminum": (0.91, 0.91, 0.92), "chromium": (0.55, 0.55, 0.54)}
 BODIES = {

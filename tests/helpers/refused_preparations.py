@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 from faults import Fault
@@ -24,4 +25,11 @@ def refused(source: Path, out: Path, settings: PrepareSettings, fault: Fault = A
     if (out / "polar").exists():
         ANYTHING.raised_by(load_scene, out)
     assert text.endswith(".")
+    return text
+
+
+def refused_in_one_line(source: Path, out: Path, settings: PrepareSettings, fault: Fault = ANYTHING) -> str:
+    """The message of a refusal, which is one line with all of its parts."""
+    text = refused(source, out, settings, fault)
+    assert re.fullmatch(r"[^\n]+: expected [^\n]+, found [^\n]+\. [^\n]+", text), text
     return text

@@ -8,8 +8,9 @@ from torch import Tensor
 
 from polarguide import optics
 from polarguide.capture import GroundTruth, Scene, View
-from polarguide.geometry.camera import Camera, look_at, unit
+from polarguide.geometry.camera import Camera, look_at
 from polarguide.geometry.polarizer import ANGLES
+from polarguide.geometry.vectors import unit
 from polarguide.optics.color import srgb_decode
 from polarguide_bench.gnerp.field import MARGIN
 

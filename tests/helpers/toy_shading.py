@@ -6,7 +6,8 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from polarguide.geometry.camera import Camera, unit
+from polarguide.geometry.camera import Camera
+from polarguide.geometry.vectors import unit
 from polarguide.methods import RECIPES
 from polarguide.shading.model import (
     Channels,

@@ -13,7 +13,8 @@ from torch import Tensor
 
 from polarguide import optics
 from polarguide.capture import load_scene
-from polarguide.geometry.camera import Camera, dot
+from polarguide.geometry.camera import Camera
+from polarguide.geometry.vectors import dot
 
 SCENES = Path(__file__).resolve().parents[3] / "shared" / "scenes"
 needs_scenes = pytest.mark.skipif(

@@ -39,7 +39,7 @@ CHOICES = re.compile(r"# (\w+(?: \| \w+)+)")
 
 EXCLUDED = {
     "polarguide batch captures --out results": "trains several captures: tests/bench/test_collections.py",
-    "polarguide prepare DATASET --out SCENE": "each dataset: tests/preparation/test_prepare_datasets.py",
+    "polarguide prepare DATASET --out SCENE": "each dataset: tests/bench/datasets/test_prepare_datasets.py",
     "make demo": "makes .venv, and runs polarguide demo there",
     "make test": "runs this test",
     "make docs": "CI runs it",

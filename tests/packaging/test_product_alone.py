@@ -122,6 +122,16 @@ def test_a_verb_of_a_neighbor_says_what_is_missing(
     assert f"{words[0]}: expected the package {package}, a part of polarguide" in said
 
 
+def test_the_reader_of_a_dataset_says_what_is_missing(product: Product, tmp_path: Path) -> None:
+    for part in ("s0", "s1", "s2"):
+        (tmp_path / "in" / part).mkdir(parents=True)
+    done = product("prepare", str(tmp_path / "in"), "--out", str(tmp_path / "out"))
+    assert done.returncode == 2
+    assert "Traceback" not in done.stderr
+    said = " ".join(done.stderr.split())
+    assert "in (dataset nersp): expected the package polarguide_bench, a part of polarguide" in said
+
+
 def test_names_and_help_do_without_the_neighbors(product: Product) -> None:
     code = (
         "import polarguide\n"

@@ -14,9 +14,7 @@ from camera_files import behind, smooth_light, write_model, write_mosaic, write_
 from camera_files import mosaic as seen_through
 from damage import EVERYWHERE, colmap_binary, duplicate, patched
 from dataset_files import write_gnerp, write_neisf, write_nersp, write_pandora, write_pisr
-from faults import Fault
-from refused_preparations import ANYTHING
-from refused_preparations import refused as refused_preparation
+from refused_preparations import refused_in_one_line as refused
 
 from polarguide.core import files
 from polarguide.geometry.polarizer import ANGLES
@@ -88,13 +86,6 @@ CELLS = [
     (kind, damage) for kind in KINDS for damage in EVERYWHERE
     if damage != "picture bomb" or kind not in NO_BOMB
 ]  # fmt: skip
-
-
-def refused(source: Path, out: Path, settings: PrepareSettings, fault: Fault = ANYTHING) -> str:
-    """The message of a refusal, which has all of its parts, and after which nothing looks like a scene."""
-    text = refused_preparation(source, out, settings, fault)
-    assert re.fullmatch(r"[^\n]+: expected [^\n]+, found [^\n]+\. [^\n]+", text), text
-    return text
 
 
 @pytest.mark.parametrize(("kind", "damage"), CELLS)

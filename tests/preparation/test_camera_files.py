@@ -40,9 +40,9 @@ from polarguide.capture.sensor.mosaics import PACKINGS, MosaicFiles, RawFormat, 
 from polarguide.capture.sensor.pattern import estimate_levels, sensor_pattern, tiled
 from polarguide.optics.color import srgb_encode_array as srgb_encode
 from polarguide.preparation.filter_source import SinglesSource
+from polarguide.preparation.mosaic_source import MosaicSource
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import PrepareSettings
-from polarguide.preparation.source import MosaicSource
 from polarguide_shots.options import ShotOptions
 from polarguide_shots.read import read_shot
 

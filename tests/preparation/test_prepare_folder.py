@@ -21,7 +21,6 @@ from faults import Fault
 from refused_preparations import MOSAIC, NAMES, refused
 
 from polarguide.capture.calibration import Calibration
-from polarguide.capture.datasets.readers import DATASETS
 from polarguide.capture.sensor.demosaic import DEMOSAIC_MODES
 from polarguide.capture.sensor.mosaics import PACKINGS
 from polarguide.capture.sensor.pattern import SENSORS
@@ -30,6 +29,7 @@ from polarguide.core.system import only_writer
 from polarguide.preparation import prepare as prepare_module
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import CalibrationOptions, PrepareSettings
+from polarguide_bench.datasets.readers import READERS
 
 
 def test_a_full_disk_and_going_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -258,7 +258,7 @@ def test_a_fault_of_ours_is_not_said_to_be_one_of_the_folder(
     def fails(*_: object, **__: object) -> None:
         raise ValueError("of ours")
 
-    monkeypatch.setattr("polarguide.preparation.source.demosaic", fails)
+    monkeypatch.setattr("polarguide.preparation.mosaic_source.demosaic", fails)
     with pytest.raises(ValueError, match="of ours"):
         prepare_scene(tmp_path / "source", tmp_path / "out", MOSAIC)
 
@@ -324,7 +324,7 @@ def choices(hint: Any) -> set[str]:
 @pytest.mark.parametrize(
     ("field", "known"),
     [
-        ("format", {"auto", "mosaic", "filter", "singles", *DATASETS}),
+        ("format", {"auto", "mosaic", "filter", "singles", *READERS}),
         ("sensor", set(SENSORS)),
         ("packing", set(PACKINGS)),
         ("demosaic", set(DEMOSAIC_MODES)),

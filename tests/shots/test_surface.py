@@ -12,7 +12,7 @@ from faults import Fault
 
 import polarguide
 from polarguide import optics
-from polarguide.geometry.camera import unit
+from polarguide.geometry.vectors import unit
 from polarguide_shots.exposures import find_shots
 from polarguide_shots.maps import Developed, NoiseModel, ShotMaps
 from polarguide_shots.options import ShotOptions

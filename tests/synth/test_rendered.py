@@ -21,7 +21,7 @@ from polarguide import optics
 from polarguide.capture.sensor.pattern import sensor_pattern
 from polarguide.core.errors import PolarguideError
 from polarguide.geometry.camera import Camera, look_at
-from polarguide.geometry.camera import unit_array as unit
+from polarguide.geometry.vectors import unit_array as unit
 from polarguide_synth.build import BuiltScene, _mesh, _user_mesh, build_scene
 from polarguide_synth.colmap import place_cameras
 from polarguide_synth.ground_truth import base_colors, ground_truth_maps, intersect

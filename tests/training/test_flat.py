@@ -10,8 +10,9 @@ from torch import Tensor
 from polarguide import optics
 from polarguide.capture import View
 from polarguide.capture.view import FULL_CODE
-from polarguide.geometry.camera import Camera, dot, look_at, unit
+from polarguide.geometry.camera import Camera, look_at
 from polarguide.geometry.polarizer import ANGLES
+from polarguide.geometry.vectors import dot, unit
 from polarguide.training.priors import FlatRules, flat_surface, flat_surfaces, view_priors
 from polarguide.training.recipe import Priors
 

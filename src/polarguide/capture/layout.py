@@ -630,3 +630,8 @@ def exposure_tables(paths: Sequence[Path]) -> list[Path]:
     """Return the tables of exposures that exist in the folders of some files."""
     tables = (folder / EXPOSURE_TABLE for folder in dict.fromkeys(path.parent for path in paths))
     return [table for table in tables if os.path.lexists(table)]
+
+
+def numbered_views(stems: set[str]) -> dict[str, int]:
+    """Return the number of each view by name, for the names that are numbers."""
+    return {stem: int(stem) for stem in sorted(stems) if stem.isascii() and stem.isdigit() and len(stem) < 7}

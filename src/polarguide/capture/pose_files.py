@@ -20,17 +20,17 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from polarguide.capture.colmap.model import PosedCamera, view_of_name
-from polarguide.capture.datasets.dataset import (
+from polarguide.capture.camera_matrices import (
     POSE_SHAPES,
     checked_intrinsics,
     checked_pose,
-    numbered_views,
     pinhole_camera,
     read_projections,
     require_known_names,
 )
+from polarguide.capture.colmap.model import PosedCamera, view_of_name
 from polarguide.capture.formats.pictures import finite_numbers, require_camera, wrong_camera
+from polarguide.capture.layout import numbered_views
 from polarguide.core.errors import PolarguideError, PolarguideWarning, require
 from polarguide.core.files import read_file
 from polarguide.core.records import LARGEST_RECORD, decode, parse

@@ -77,9 +77,7 @@ def inspect_capture(
     folder = inspection.inspection_folder(scene, out)
     backend = importlib.import_module("polarguide.raster").choose_backend(compute.device, say=reporter.say)
     inspected = inspection.inspect_scene(scene, settings, backend, reporter)
-    page, record = importlib.import_module("polarguide.inspection.inspect").write_inspection(
-        inspected, folder, reporter
-    )
+    page, record = inspection.write_inspection(inspected, folder, reporter)
     _print_checks(inspected.checks)
     if inspected.capture.four:
         _print_angles(inspected.angles)

@@ -315,13 +315,12 @@ def demo(
 
 def _first_picture(out: Path) -> Path:
     """Write a held-out view with its layers, larger than its photograph, and return the path."""
-    layers = importlib.import_module("polarguide.visualization.figures")
     figures = importlib.import_module("polarguide.visualization.figures")
     run = polarguide.open_run(out)
     camera = run.scene.view(FIRST_VIEW).camera
     camera = camera.scaled(FINER, FINER * camera.width, FINER * camera.height)
     result = run.result(camera).to("cpu")
-    tiles = [layers.layer_picture(result, name, camera) for name in FIRST_LAYERS]
+    tiles = [figures.layer_picture(result, name, camera) for name in FIRST_LAYERS]
     path = out / "first_picture.png"
     figures.write_png(path, figures.contact_sheet([tiles], [FIRST_VIEW], FIRST_LAYERS))
     return path
@@ -519,7 +518,11 @@ def run_folder(
         ["view", str(folder / "run"), *compute],
     ]
     commands = commands[posed : len(commands) if view else -1]
-    say(f"recognized: {'a scene with poses' if posed else _description(source, settings)}")
+    recognized = "a scene with poses"
+    if not posed:
+        opening = importlib.import_module("polarguide.preparation.open_source")
+        recognized = opening.describe_source(source, settings)
+    say(f"recognized: {recognized}")
     for words in commands:
         say(f"  {command(*words)}")
     for words in commands:
@@ -556,13 +559,6 @@ def _require_usable(source: Path, folder: Path, unused: Sequence[str]) -> None:
         found=f"{CONFIGURATION} of a training",
         remedy="Choose another folder with --out.",
     )
-
-
-def _description(source: Path, settings: PrepareSettings) -> str:
-    description: str = importlib.import_module("polarguide.preparation.open_source").describe_source(
-        source, settings
-    )
-    return description
 
 
 def _call(words: Sequence[str], scene: Path, folder: Path) -> None:

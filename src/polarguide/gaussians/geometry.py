@@ -11,7 +11,7 @@ from torch.nn.functional import normalize
 
 from polarguide import _native
 from polarguide.core.native import fits
-from polarguide.geometry.camera import dot, unit
+from polarguide.geometry.vectors import dot, unit
 
 GRAZING = 0.35
 """Cosine of the angle between a normal and the direction to the camera.

@@ -24,7 +24,7 @@ from torch import Tensor
 from polarguide.core.errors import PolarguideError
 from polarguide.core.files import atomic
 from polarguide.gaussians.harmonics import sh_basis
-from polarguide.geometry.camera import spread_directions
+from polarguide.geometry.vectors import spread_directions
 
 REST_COUNT = 15
 DIRECTIONS = 64

@@ -1,54 +1,23 @@
-"""Pinhole cameras with a pose, and vectors of three components along the last axis.
+"""Pinhole cameras with a pose.
 
-Camera axes are the axes of OpenCV: x right, y down, z forward. A pose maps world to camera coordinates, ``x_cam = R
-    x_world + t``. The center of the top-left pixel is at (0.5, 0.5), as in COLMAP.
-
-Products of vectors are written component by component, because PyTorch's reductions over three values are slow.
+Camera axes are the axes of OpenCV: x right, y down, z forward. A pose maps world to camera coordinates,
+``x_cam = R x_world + t``. The center of the top-left pixel is at (0.5, 0.5), as in COLMAP.
 """
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from polarguide.core.errors import PolarguideError
-
-
-def dot(a: Tensor, b: Tensor) -> Tensor:
-    """Return scalar products [...] of vectors [..., 3]."""
-    ax, ay, az = a.unbind(-1)
-    bx, by, bz = b.unbind(-1)
-    return ax * bx + ay * by + az * bz
-
-
-def unit(vectors: Tensor, floor: float = 1e-6) -> Tensor:
-    """Divide vectors [..., 3] by their length, or by ``floor`` if they are shorter than ``floor``; zero stays zero."""
-    squared = dot(vectors, vectors)
-    return vectors * torch.rsqrt(squared.clamp(min=floor * floor))[..., None]
-
-
-def spread_directions(count: int) -> Tensor:
-    """Return unit vectors [count, 3] float64, evenly distributed over the sphere (a Fibonacci lattice)."""
-    place = torch.arange(count, dtype=torch.float64) + 0.5
-    z = 1 - 2 * place / count
-    around = math.pi * (1 + math.sqrt(5)) * place
-    flat = (1 - z * z).sqrt()
-    return torch.stack((flat * around.cos(), flat * around.sin(), z), dim=1)
-
-
-def unit_array(vectors: NDArray[Any]) -> NDArray[np.float64]:
-    """Divide vectors [..., 3] in a NumPy array by their length; zero stays zero."""
-    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    return np.asarray(vectors / np.maximum(length, 1e-300))
-
+from polarguide.geometry.vectors import unit, unit_array
 
 FARTHEST = 1e9
 """Upper bound of coordinates and focal lengths, beyond which single precision is too coarse."""

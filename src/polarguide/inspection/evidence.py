@@ -29,7 +29,8 @@ from polarguide.capture.angle_evidence import (
     sum_by_cluster,
 )
 from polarguide.capture.colmap.model import ColmapModel
-from polarguide.geometry.camera import Camera, dot, unit
+from polarguide.geometry.camera import Camera
+from polarguide.geometry.vectors import dot, unit
 from polarguide.inspection.capture import InspectedView
 from polarguide.methods import recipe_named
 from polarguide.raster import Backend

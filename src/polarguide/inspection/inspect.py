@@ -29,8 +29,9 @@ from polarguide.core.options import index_of
 from polarguide.core.progress import SILENT, Reporter
 from polarguide.core.records import check_options, to_json
 from polarguide.core.text import printable
-from polarguide.geometry.camera import Camera, unit_array
+from polarguide.geometry.camera import Camera
 from polarguide.geometry.scene_frame import scene_frame
+from polarguide.geometry.vectors import unit_array
 from polarguide.inspection.angles import AngleFindings, angle_checks, combine_evidence
 from polarguide.inspection.capture import (
     Capture,

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from polarguide.geometry.camera import dot
+from polarguide.geometry.vectors import dot
 
 
 def safe_sqrt(x: Tensor) -> Tensor:

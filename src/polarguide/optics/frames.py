@@ -10,7 +10,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from polarguide.geometry.camera import dot
+from polarguide.geometry.vectors import dot
 from polarguide.optics._numerics import for_arrays, safe_atan2
 
 

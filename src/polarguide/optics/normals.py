@@ -24,7 +24,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from polarguide.geometry.camera import dot
+from polarguide.geometry.vectors import dot
 from polarguide.optics._numerics import (
     check_leading,
     check_refractive_index,

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from polarguide.geometry.camera import dot
+from polarguide.geometry.vectors import dot
 from polarguide.optics._numerics import check_leading, for_arrays, safe_normalize
 from polarguide.optics.frames import lens_frame
 from polarguide.optics.fresnel import dolp_slopes, reflectances, transmittances

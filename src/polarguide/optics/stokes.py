@@ -17,8 +17,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from polarguide.geometry.camera import dot
 from polarguide.geometry.polarizer import malus, stokes_of_four
+from polarguide.geometry.vectors import dot
 from polarguide.optics._numerics import check_leading, for_arrays, safe_atan2, safe_sqrt
 from polarguide.optics.frames import lens_frame
 

@@ -15,7 +15,6 @@ from pathlib import Path
 from polarguide.capture.calibration import QUARTER_TURNS, TURNS
 from polarguide.capture.colmap.model import holds_model, view_of_name
 from polarguide.capture.colmap.poses import Poses
-from polarguide.capture.datasets.readers import PISR_SENSOR, detect_dataset, open_dataset
 from polarguide.capture.exposures import TABLE, angles_of_names, folders_of_angles, parse_angle
 from polarguide.capture.filter.shots import (
     SHOT_SUFFIXES,
@@ -39,11 +38,13 @@ from polarguide.capture.pose_files import TEST, parts_of_poses, read_parts
 from polarguide.capture.sensor.mosaics import RAW_SUFFIXES
 from polarguide.capture.sensor.pattern import SENSOR_NAMES
 from polarguide.capture.view import ANGLES, listed
-from polarguide.core.errors import PolarguideError, PolarguideWarning, require
+from polarguide.core.errors import PolarguideError, PolarguideWarning, import_part, require
 from polarguide.core.files import require_folder
 from polarguide.core.progress import Reporter
 from polarguide.core.text import command, stem_of
+from polarguide.preparation.datasets import READERS, detect_dataset
 from polarguide.preparation.filter_source import FilterSource, ShotsSource, SinglesSource
+from polarguide.preparation.mosaic_source import MosaicSource
 from polarguide.preparation.settings import (
     FilterSettings,
     MosaicSettings,
@@ -51,7 +52,7 @@ from polarguide.preparation.settings import (
     SinglesSettings,
     settings_of_format,
 )
-from polarguide.preparation.source import MosaicSource, Source, StokesSource
+from polarguide.preparation.source import Source
 
 
 def _find_masks(folder: Path, views: Sequence[str]) -> dict[str, Path]:
@@ -360,16 +361,10 @@ def _source(
         case MosaicSettings() as mosaics if kind == "mosaic":
             return MosaicSource(root, mosaics)
         case others:
-            dataset = open_dataset(root, kind, transfer=settings.transfer)
-            sense = settings.calibration.sense or dataset.sense
-            if dataset.mosaics is None or not isinstance(others, MosaicSettings):
-                return StokesSource(dataset, others)
-            mosaics = replace(
-                others,
-                sensor=settings.sensor or PISR_SENSOR,
-                calibration=replace(settings.calibration, sense=sense),
+            source: Source = import_part(READERS, f"{root} (dataset {kind})").dataset_source(
+                root, kind, others
             )
-            return MosaicSource(dataset.mosaics, mosaics, dataset)
+            return source
 
 
 def origin_of_poses(pictures: Source, origin: str) -> str:

@@ -27,8 +27,8 @@ from polarguide.core.errors import PolarguideError, require
 from polarguide.core.records import option_name
 from polarguide.core.text import decimals, whole_number
 from polarguide.geometry.polarizer import ANGLES
+from polarguide.preparation.datasets import DatasetName
 
-Dataset = Literal["pandora", "pisr", "nersp", "neisf", "gnerp", "phygap"]
 ORIGINS = ("auto", "dataset", "sfm", "none")
 """Allowed values of the setting ``poses``, apart from paths."""
 
@@ -120,7 +120,7 @@ class PrepareSettings(RawOptions, MosaicSettings, SinglesSettings):
         seed: Seed of SfM.
     """
 
-    format: Literal["auto", "mosaic", "filter", "singles"] | Dataset = "auto"
+    format: Literal["auto", "mosaic", "filter", "singles"] | DatasetName = "auto"
     poses: str = "auto"
     poses_of: Literal["auto", "stored", "displayed"] = "auto"
     matching: Literal["auto", "exhaustive", "sequential"] = "auto"

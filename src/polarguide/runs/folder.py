@@ -33,7 +33,7 @@ from polarguide.core.errors import PolarguideError
 from polarguide.core.files import atomic, in_utf8, make_folder, read_file, require_file, write_text, writing
 from polarguide.core.options import Transfer, index_of
 from polarguide.core.records import LARGEST_RECORD, decode
-from polarguide.training.checked import refuse_foreign
+from polarguide.training.checkpoint_checks import refuse_foreign
 from polarguide.training.context import SavedState, TrainingState
 from polarguide.training.recipe import Recipe
 from polarguide.training.settings import STEPS, ResolvedSettings, TrainSettings

@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 from polarguide.core.native import fits
-from polarguide.geometry.camera import Camera, dot, unit
+from polarguide.geometry.camera import Camera
+from polarguide.geometry.vectors import dot, unit
 from polarguide.optics import reflectances_from_cosine
 from polarguide.shading.cubemap import LEVELS, cubemap_lookup, gltf_roughness, light_levels, mip_lookup
 from polarguide.shading.metal import (

@@ -29,7 +29,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import relu
 
-from polarguide.geometry.camera import Camera, unit
+from polarguide.geometry.camera import Camera
+from polarguide.geometry.vectors import unit
 from polarguide.shading.cubemap import box_mips, mip_lookup
 from polarguide.shading.model import (
     MAXIMUM_LOG_LIGHT,

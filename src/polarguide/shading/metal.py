@@ -29,7 +29,8 @@ from polarguide import optics
 from polarguide.gaussians.gaussians import Gaussians, any_nonzero
 from polarguide.gaussians.geometry import shortest_axis_normals
 from polarguide.gaussians.harmonics import sh_basis
-from polarguide.geometry.camera import Camera, dot, spread_directions, unit
+from polarguide.geometry.camera import Camera
+from polarguide.geometry.vectors import dot, spread_directions, unit
 from polarguide.optics.fresnel import LARGEST_REFLECTANCE
 from polarguide.shading.cubemap import cubemap_lookup
 from polarguide.shading.result import MetalPixels, RenderResult

@@ -18,7 +18,8 @@ from torch import Tensor
 from polarguide.gaussians.gaussians import Parameters as Parameters
 from polarguide.gaussians.geometry import mirrored_directions
 from polarguide.gaussians.harmonics import evaluate_sh
-from polarguide.geometry.camera import Camera, dot
+from polarguide.geometry.camera import Camera
+from polarguide.geometry.vectors import dot
 from polarguide.shading.metal import layer_stokes
 from polarguide.shading.result import ChannelSlices, MetalPixels, RenderResult
 from polarguide.shading.surface import Parameter as Parameter

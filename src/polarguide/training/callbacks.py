@@ -12,7 +12,8 @@ from torch import Tensor
 from polarguide.capture import View
 from polarguide.core.errors import require
 from polarguide.gaussians.densify import DensityStatistics, densify, free_space
-from polarguide.geometry.camera import Camera, seen_at, unit
+from polarguide.geometry.camera import Camera, seen_at
+from polarguide.geometry.vectors import unit
 from polarguide.raster import Rasterize
 from polarguide.raster.magnification import footprints
 from polarguide.shading.gbuffer import RenderRequest, render, splats

@@ -19,7 +19,8 @@ from torch.nn.functional import pad
 from polarguide import _native
 from polarguide.core.errors import PolarguideError
 from polarguide.core.native import fits
-from polarguide.geometry.camera import Camera, dot, unit
+from polarguide.geometry.camera import Camera
+from polarguide.geometry.vectors import dot, unit
 from polarguide.shading.model import ShadingModel
 from polarguide.shading.result import RenderResult
 from polarguide.training.photometric import partial_terms, photometric_loss, photometric_terms

@@ -104,13 +104,6 @@ def photometric_terms_reference(
     return Photometric((weight * per_value).sum() / count, (weight * squared).sum() / count)
 
 
-def photometric_loss_reference(
-    prediction: Tensor, target: Tensor, weight: Tensor | None = None, ssim_weight: float = 0.2
-) -> Tensor:
-    """Return the loss of ``photometric_terms_reference``."""
-    return photometric_terms_reference(prediction, target, weight, ssim_weight).loss
-
-
 class _Photometric(torch.autograd.Function):
     @staticmethod
     def forward(

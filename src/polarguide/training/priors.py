@@ -28,7 +28,7 @@ from torch import Tensor
 from polarguide import optics
 from polarguide.capture import View
 from polarguide.capture.exposures import FOUR
-from polarguide.geometry.camera import dot, unit
+from polarguide.geometry.vectors import dot, unit
 from polarguide.optics.color import srgb_encode
 from polarguide.training.recipe import Candidates, FlatRules, Priors
 from polarguide.training.targets import ViewPriors

@@ -21,7 +21,8 @@ from polarguide.capture import Scene, View
 from polarguide.capture.presentation import Crop, Presentation, colored
 from polarguide.gaussians.gaussians import Gaussians
 from polarguide.geometry.camera import Camera, quaternion
-from polarguide.geometry.scene_frame import SceneFrame, camera_record, interpolated
+from polarguide.geometry.camera_path import camera_record, interpolated
+from polarguide.geometry.scene_frame import SceneFrame
 from polarguide.raster.interface import Rasterize
 from polarguide.results.rendering.relight import RELIT_RESOLUTION, turned_cubemap
 from polarguide.runs.opened import OpenedRun

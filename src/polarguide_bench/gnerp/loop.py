@@ -13,7 +13,8 @@ import torch
 from torch import Tensor
 
 from polarguide.capture import Scene, View
-from polarguide.geometry.camera import Camera, dot, unit
+from polarguide.geometry.camera import Camera
+from polarguide.geometry.vectors import dot, unit
 from polarguide.optics import aolp, dolp, lens_frame, luminance
 from polarguide.optics.color import srgb_encode
 from polarguide.training.callback import Loop

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from polarguide.geometry.camera import dot, unit
+from polarguide.geometry.vectors import dot, unit
 from polarguide_bench.gnerp.field import Field
 from polarguide_bench.gnerp.recipe import Sampling
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from polarguide.gaussians.gaussians import Adam
 from polarguide.geometry.camera import Camera
-from polarguide.training.checked import MOST_STEPS, TensorRule, check_tensors, moment_rules
+from polarguide.training.checkpoint_checks import MOST_STEPS, TensorRule, check_tensors, moment_rules
 from polarguide.training.context import seeded
 from polarguide_bench.gnerp.field import Field, Region
 from polarguide_bench.gnerp.recipe import NeuralRecipe

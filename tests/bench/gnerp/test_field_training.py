@@ -17,7 +17,7 @@ from polarguide import optics
 from polarguide.capture import Scene
 from polarguide.capture.variants import select_exposures
 from polarguide.core.options import SceneOptions, SessionOptions
-from polarguide.geometry.camera import dot, unit
+from polarguide.geometry.vectors import dot, unit
 from polarguide.results.evaluation.evaluate import evaluate
 from polarguide.runs import memory_plan
 from polarguide.runs.callbacks import TrainingStopped

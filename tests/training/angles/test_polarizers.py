@@ -20,7 +20,7 @@ from polarguide.capture.variants import select_exposures
 from polarguide.methods import RECIPES, recipe_named
 from polarguide.runs.health import report_polarizers
 from polarguide.training.angles.polarizers import Polarizers, gaussian_training
-from polarguide.training.checked import refuse_foreign
+from polarguide.training.checkpoint_checks import refuse_foreign
 from polarguide.training.context import TrainingState
 from polarguide.training.loop import TrainingLoop
 from polarguide.training.recipe import AngleRules, Recipe

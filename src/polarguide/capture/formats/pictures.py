@@ -30,6 +30,7 @@ from polarguide.capture.formats.stored import (
     exr_size,
     hdr_size,
     picture_kind,
+    read_picture,
     rescaled,
     stated_full_scale,
 )
@@ -370,6 +371,22 @@ def decode_mask(path: Path, data: bytes, *, any_value: bool) -> NDArray[np.bool_
         mask &= 2.0 * gray >= float(gray.max())
     _require_one_mask(path, pixels, mask)
     return mask
+
+
+def read_mask(path: Path) -> NDArray[np.bool_]:
+    """Read a foreground mask [H, W] from a picture.
+
+    A pixel is foreground if its value is at least half of the largest value. In a picture with transparent pixels, a
+    pixel is foreground if it is at least half opaque.
+    """
+    data = read_picture(path)
+    pixels = decode_stored(path, data)
+    if pixels.ndim == 3 and pixels.shape[2] in (2, 4) and pixels.dtype.kind == "u":
+        alpha = pixels[..., -1]
+        full = int(np.iinfo(pixels.dtype).max)
+        if (alpha < full).any():
+            return np.asarray(2 * alpha.astype(np.int64) >= full)
+    return decode_mask(path, data, any_value=False)
 
 
 _BLACK = 0.04  # largest value of compressed black, relative to the maximum of a mask

@@ -76,8 +76,8 @@ NOT_TRAINING = ("results", *NOT_SCORING)
 """Parts of the package that training never imports."""
 BENCH = "polarguide_bench"
 """Neighboring package with the recipes of comparisons."""
-BENCH_METHODS = ("recipes.py", "polgs.py", "gnerp")
-"""Parts of the bench that train and score. The other parts plan runs and write tables."""
+BENCH_METHODS = ("recipes.py", "polgs.py", "gnerp", "datasets")
+"""Parts of the bench that prepare, train and score. The other parts plan runs and write tables."""
 
 
 @lru_cache

@@ -50,9 +50,10 @@ from polarguide.core.options import (
     check_finite,
 )
 from polarguide.core.progress import SILENT, Reporter
-from polarguide.geometry.camera import Camera, dot
+from polarguide.geometry.camera import Camera
 from polarguide.geometry.coverage import OPAQUE
 from polarguide.geometry.scene_frame import SceneFrame
+from polarguide.geometry.vectors import dot
 from polarguide.optics.color import srgb_encode
 from polarguide.results.evaluation.evaluate import METRICS_FILE, read_metrics
 from polarguide.results.evaluation.table import shown_metrics

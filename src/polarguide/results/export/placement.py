@@ -27,8 +27,9 @@ from polarguide.core.options import Axes
 from polarguide.core.progress import SILENT, Reporter
 from polarguide.gaussians.harmonics import sh_basis
 from polarguide.gaussians.ply import REST_COUNT
-from polarguide.geometry.camera import Camera, spread_directions
+from polarguide.geometry.camera import Camera
 from polarguide.geometry.scene_frame import SceneFrame
+from polarguide.geometry.vectors import spread_directions
 from polarguide.results.rendering.mesh import Subject, subject_of
 from polarguide.runs.opened import OpenedRun
 from polarguide.shading.gbuffer import RenderRequest, render

@@ -26,7 +26,8 @@ from polarguide.core.progress import SILENT, Reporter
 from polarguide.gaussians.gaussians import Parameters
 from polarguide.gaussians.geometry import shortest_axis_normals
 from polarguide.geometry.camera import Camera
-from polarguide.geometry.scene_frame import camera_record, scene_frame
+from polarguide.geometry.camera_path import camera_record
+from polarguide.geometry.scene_frame import scene_frame
 from polarguide.raster.interface import MINIMUM_ALPHA
 from polarguide.results.evaluation.evaluate import METRICS_FILE, read_metrics
 from polarguide.results.evaluation.table import shown_metrics

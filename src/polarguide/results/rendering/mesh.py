@@ -22,8 +22,9 @@ from torch import Tensor
 from polarguide.core.errors import PolarguideError, optional_import
 from polarguide.core.progress import Reporter
 from polarguide.core.text import command
-from polarguide.geometry.camera import Camera, dot, seen_at, unit
+from polarguide.geometry.camera import Camera, seen_at
 from polarguide.geometry.scene_frame import scene_frame
+from polarguide.geometry.vectors import dot, unit
 from polarguide.runs.model import Within
 from polarguide.runs.opened import OpenedRun
 from polarguide.shading.result import RenderResult

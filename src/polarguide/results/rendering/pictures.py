@@ -24,7 +24,7 @@ from polarguide.core.options import PathLike, PictureFormat, check_choice, check
 from polarguide.core.progress import SILENT, Reporter
 from polarguide.core.records import to_json
 from polarguide.geometry.camera import Camera
-from polarguide.geometry.scene_frame import interpolated, orbit, read_path
+from polarguide.geometry.camera_path import interpolated, orbit, read_path
 from polarguide.optics import luminance
 from polarguide.results.rendering.mesh import part_shown, subject_of
 from polarguide.results.rendering.relight import write_exr

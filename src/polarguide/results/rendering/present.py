@@ -46,7 +46,8 @@ from polarguide.core.options import DeviceName, PathLike
 from polarguide.core.progress import SILENT, Reporter
 from polarguide.core.records import decode
 from polarguide.core.text import command, decimals
-from polarguide.geometry.camera import Camera, unit
+from polarguide.geometry.camera import Camera
+from polarguide.geometry.vectors import unit
 from polarguide.runs.folder import CONFIGURATION
 from polarguide.runs.opened import OpenedRun
 from polarguide.shading.result import RenderResult

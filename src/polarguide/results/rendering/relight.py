@@ -23,8 +23,8 @@ from polarguide.core.errors import PolarguideError, optional_import
 from polarguide.core.files import atomic, in_utf8, write_whole
 from polarguide.core.options import PathLike
 from polarguide.core.progress import SILENT, Advance, Reporter
-from polarguide.geometry.camera import unit
 from polarguide.geometry.scene_frame import SceneFrame
+from polarguide.geometry.vectors import unit
 from polarguide.runs.opened import OpenedRun
 from polarguide.shading.cubemap import cubemap_lookup, texel_directions
 from polarguide.shading.model import RadianceCubemap, ShadingModel, mirrored, radiance_cubemap

@@ -16,7 +16,8 @@ from polarguide._native import MAX_CHANNELS
 from polarguide.capture import View
 from polarguide.core.system import UNBOUNDED, MemoryBound
 from polarguide.gaussians.gaussians import any_nonzero
-from polarguide.geometry.camera import Camera, dot
+from polarguide.geometry.camera import Camera
+from polarguide.geometry.vectors import dot
 from polarguide.raster import Rasterize
 from polarguide.shading.gbuffer import RenderRequest, render, splats
 from polarguide.shading.model import Parameters

@@ -35,7 +35,7 @@ from polarguide.core.system import UNBOUNDED, MemoryBound
 from polarguide.gaussians.gaussians import Gaussians
 from polarguide.gaussians.geometry import shortest_axis_normals
 from polarguide.gaussians.initialize import far_away
-from polarguide.geometry.camera import dot
+from polarguide.geometry.vectors import dot
 from polarguide.raster import Rasterize
 from polarguide.shading.gbuffer import render
 from polarguide.shading.metal import FIRST_REFLECTANCE, become_metal

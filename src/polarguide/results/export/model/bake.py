@@ -32,7 +32,8 @@ from polarguide.capture import View
 from polarguide.core.errors import optional_import
 from polarguide.core.progress import Advance, Reporter
 from polarguide.gaussians.harmonics import sh_basis
-from polarguide.geometry.camera import Camera, dot, spread_directions, unit
+from polarguide.geometry.camera import Camera
+from polarguide.geometry.vectors import dot, spread_directions, unit
 from polarguide.optics import reflectances_from_cosine
 from polarguide.raster.surface import WIDTH
 from polarguide.results.export.model.topology import Places

@@ -21,7 +21,7 @@ from polarguide.capture import Scene
 from polarguide.core.options import SceneOptions, SessionOptions
 from polarguide.methods import RECIPES
 from polarguide.runs.folder import CHECKPOINT, load_checkpoint
-from polarguide.training.checked import refuse_foreign
+from polarguide.training.checkpoint_checks import refuse_foreign
 from polarguide.training.context import Environment, TrainingState, first_state
 from polarguide.training.recipe import Recipe
 from polarguide.training.settings import TrainSettings

@@ -25,12 +25,14 @@ from faults import Fault
 
 from polarguide.capture.angle_evidence import OutlineAgreement, outline_agreement, sense_of_outlines
 from polarguide.capture.calibration import Calibration
-from polarguide.capture.datasets.dataset import Dataset, read_mask
-from polarguide.capture.datasets.readers import detect_dataset, open_dataset
+from polarguide.capture.formats.pictures import read_mask
 from polarguide.core.errors import PolarguideWarning
+from polarguide.preparation.datasets import LAYOUTS, detect_dataset
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import PrepareSettings
-from polarguide.preparation.source import StokesSource
+from polarguide_bench.datasets.dataset import Dataset
+from polarguide_bench.datasets.readers import READERS, open_dataset
+from polarguide_bench.datasets.sources import StokesSource
 
 Change = Callable[[Path], object]
 
@@ -135,6 +137,10 @@ def changed(root: Path, name: str, changes: tuple[Change, ...]) -> Dataset:
     kind = detect_dataset(root)
     assert kind == name
     return open_dataset(root, kind)
+
+
+def test_every_reader_has_a_layout() -> None:
+    assert {*LAYOUTS, "pandora"} == READERS.keys()
 
 
 @pytest.mark.parametrize("case", CASES)

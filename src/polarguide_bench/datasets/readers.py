@@ -7,33 +7,21 @@ import re
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from polarguide.capture.colmap.model import PosedCamera
-from polarguide.capture.datasets.dataset import (
+from polarguide.capture.camera_matrices import (
     POSE_SHAPES,
-    Dataset,
-    StokesImage,
-    cameras_of_views,
     checked_intrinsics,
     checked_pose,
-    distorted_camera,
-    first_picture_size,
-    masks_beside,
-    numbered_views,
     pinhole_camera,
-    read_mask,
     read_projections,
     require_entries,
-    require_files,
     require_known_names,
-    require_published,
-    require_same_shape,
-    stokes_dataset,
 )
+from polarguide.capture.colmap.model import PosedCamera
 from polarguide.capture.formats.pictures import (
     array_kind,
     array_size,
@@ -44,6 +32,7 @@ from polarguide.capture.formats.pictures import (
     read_array,
     read_arrays,
     read_exr,
+    read_mask,
 )
 from polarguide.capture.formats.stored import (
     LARGEST_PIXELS,
@@ -52,16 +41,27 @@ from polarguide.capture.formats.stored import (
     read_picture,
     stated_size,
 )
-from polarguide.capture.layout import index_files
+from polarguide.capture.layout import index_files, numbered_views
 from polarguide.capture.pose_files import Size, is_centered
 from polarguide.capture.view import FULL_CODE
 from polarguide.core.errors import PolarguideWarning
 from polarguide.core.files import read_file
 from polarguide.core.records import read_record
-from polarguide.core.text import number_or_nan
+from polarguide.core.text import listed, number_or_nan
+from polarguide.preparation.datasets import STOKES_FOLDERS, first_existing
+from polarguide_bench.datasets.dataset import (
+    Dataset,
+    StokesImage,
+    cameras_of_views,
+    distorted_camera,
+    first_picture_size,
+    masks_beside,
+    require_files,
+    require_published,
+    require_same_shape,
+    stokes_dataset,
+)
 
-STOKES_FOLDERS = ("images_stokes", "train_images_stokes")
-"""Folders with the Stokes vectors of PANDORA, in the original and in the copies of NeRSP, PolGS and PhyGaP."""
 _PICTURES = ("image", "images", "train", "I-sum", "I_sum")
 _MAPS = ("input_azimuth_maps", "train_input_azimuth_maps")
 _PANDORA_PARTS = ("s0", "s0p1", "s0p2")
@@ -74,12 +74,12 @@ def open_pandora(root: Path) -> Dataset:
     Raises:
         PolarguideError: a file is missing, or the cameras are invalid.
     """
-    folder = _first_path(root, STOKES_FOLDERS)
+    folder = first_existing(root, STOKES_FOLDERS)
     cameras_file = root / "cameras.npz"
     matches = [_PANDORA_STEM.fullmatch(stem) for stem in index_files(folder, (".hdr",))]
     views = sorted({match["view"] for match in matches if match is not None})
     files = {view: [folder / f"{view}_{part}.hdr" for part in _PANDORA_PARTS] for view in views}
-    pictures = index_files(_first_path(root, _PICTURES), SUFFIXES)
+    pictures = index_files(first_existing(root, _PICTURES), SUFFIXES)
     numbers = {view: int(view) for view in views}
     # The first view has the number 1, unless a file has the name 00.
     first = 0 if 0 in numbers.values() or "00" in pictures else 1
@@ -118,11 +118,11 @@ def open_nersp(root: Path) -> Dataset:
     Raises:
         PolarguideError: a file is missing, or the cameras are invalid.
     """
-    cameras_file = _first_path(root, _NERSP_CAMERAS)
-    archives = index_files(_first_path(root, STOKES_FOLDERS), (".npz",))
+    cameras_file = first_existing(root, _NERSP_CAMERAS)
+    archives = index_files(first_existing(root, STOKES_FOLDERS), (".npz",))
     stems = set(archives) or {stem for part in _NERSP_PARTS for stem in index_files(root / part, (".npy",))}
     views = numbered_views(stems)
-    pictures = index_files(_first_path(root, _PICTURES), SUFFIXES)
+    pictures = index_files(first_existing(root, _PICTURES), SUFFIXES)
     light = None if archives else next(iter(sorted((root / _NERSP_PARTS[0]).glob("*.npy"))), None)
     cameras, _ = _cameras(root, cameras_file, views, pictures, light, (0,))
     masks, read_mask = _masks(root, views, 0)
@@ -154,7 +154,8 @@ def _read_archive(paths: Sequence[Path]) -> NDArray[np.float32]:
     """
     (path,) = paths
     arrays = decode_arrays(path, read_file(path), _NERSP_ENTRIES, 3 * 8 * 3 * LARGEST_PIXELS, kinds="biufcSU")
-    require_entries(path, arrays, *_NERSP_ENTRIES)
+    for key in _NERSP_ENTRIES:
+        require_published(key in arrays, path, f"the entry {key}", listed(sorted(arrays)) or "no entry")
     for key in _NERSP_ENTRIES:
         plane = arrays[key]
         require_published(
@@ -165,11 +166,6 @@ def _read_archive(paths: Sequence[Path]) -> NDArray[np.float32]:
         )
         require_same_shape(path, plane.shape, arrays["S0"].shape, path)
     return np.stack([arrays[key] for key in _NERSP_ENTRIES]).astype(np.float32)
-
-
-def _first_path(root: Path, names: Sequence[str]) -> Path:
-    """Return the path of the first name that exists in a folder. If no name exists, return the path of the first."""
-    return next((root / name for name in names if (root / name).exists()), root / names[0])
 
 
 def _cameras(
@@ -202,7 +198,7 @@ def _cameras(
     known = projections.cameras
     size = (1, 1)
     if views:
-        size = first_picture_size(pictures, _first_path(root, _PICTURES))
+        size = first_picture_size(pictures, first_existing(root, _PICTURES))
         size = _camera_size(path, [inner for inner, *_ in known.values()], size, light)
     if offsets is None:
         offsets = (-1,) if 0 in known else (0, -1)
@@ -259,7 +255,7 @@ def _masks(
     Returns:
         The file of the mask by view name, and the function that reads such a file.
     """
-    maps = index_files(_first_path(root, _MAPS), (".png",))
+    maps = index_files(first_existing(root, _MAPS), (".png",))
     if not maps:
         return masks_beside(root, views), read_mask
     by_index = {number: maps[stem] for stem, number in numbered_views(set(maps)).items()}
@@ -416,7 +412,6 @@ def _gnerp_cameras(path: Path, size: tuple[int, int]) -> dict[int, PosedCamera]:
     return cameras
 
 
-PHYGAP_CAMERAS = "camera_params.npz"
 _PHYGAP_ENTRIES = {"intrinsics", "extrinsics", "image_width", "image_height", "fov"}
 """Known entries of the camera file. The angle of view (``fov``) is redundant and not used."""
 _CHANNELS = tuple(f"S{part}.{color}" for part in range(3) for color in "RGB")
@@ -428,9 +423,9 @@ def open_phygap(root: Path) -> Dataset:
     Raises:
         PolarguideError: a file is missing, or the cameras are invalid.
     """
-    stored = index_files(_first_path(root, ("images_full", "images")), (".exr",))
+    stored = index_files(first_existing(root, ("images_full", "images")), (".exr",))
     numbers = numbered_views(set(stored))
-    path = root / PHYGAP_CAMERAS
+    path = root / "camera_params.npz"
     arrays = read_arrays(path)
     require_entries(path, arrays, "intrinsics", "extrinsics", "image_width", "image_height")
     require_known_names(path, arrays.keys() - _PHYGAP_ENTRIES)
@@ -479,7 +474,6 @@ def _read_mitsuba(paths: Sequence[Path]) -> NDArray[np.float32]:
     return np.stack([s0, -s1, -s2])
 
 
-PISR_SENSOR: Final = "IMX250MYR"
 _PISR_SIZE = (1224, 1024)
 """Width and height of the pictures to which ``camera_matrix`` refers."""
 # Known entries of the camera file. The poses of the calibration target and the error of the calibration are not used.
@@ -495,7 +489,7 @@ def open_pisr(root: Path) -> Dataset:
     """
     files = index_files(root / "raw", (".npy",))
     numbers = numbered_views(set(files))
-    cameras_file = _first_path(root, _PISR_CAMERAS)
+    cameras_file = first_existing(root, _PISR_CAMERAS)
     inner_file = root / "intrinsics.npz"
     intrinsics = read_arrays(inner_file)
     require_entries(inner_file, intrinsics, "camera_matrix", "dist_coeffs")
@@ -538,32 +532,15 @@ def _gamma(root: Path, files: Sequence[Path]) -> float:
     return gamma
 
 
-DATASETS: dict[str, tuple[tuple[str, ...], Callable[..., Dataset]]] = {
-    "nersp": (("s0/", "s1/", "s2/"), open_nersp),
-    "pisr": (("raw/", "intrinsics.npz"), open_pisr),
-    "neisf": (("images_s0/", "images_s1/", "images_s2/"), open_neisf),
-    "gnerp": (("cameras.json", "aop/", "dop/"), open_gnerp),
-    "phygap": ((PHYGAP_CAMERAS,), open_phygap),
-    "pandora": ((), open_pandora),
+READERS: dict[str, Callable[..., Dataset]] = {
+    "nersp": open_nersp,
+    "pisr": open_pisr,
+    "neisf": open_neisf,
+    "gnerp": open_gnerp,
+    "phygap": open_phygap,
+    "pandora": open_pandora,
 }
-"""Layout and reader of each dataset by name.
-
-The layout is a tuple of files and folders that identify the dataset. The reader is the function that opens it. PANDORA
-and RMVP3D differ in the names of the files in ``images_stokes/``.
-"""
-
-
-def detect_dataset(root: Path) -> str | None:
-    """Detect a dataset by the layout of a folder, and return its name. Return None for any other layout."""
-    folder = _first_path(root, STOKES_FOLDERS)
-    if folder.is_dir():
-        return "nersp" if any(path.suffix.lower() == ".npz" for path in folder.iterdir()) else "pandora"
-    for name, (parts, _) in DATASETS.items():
-        if parts and all(
-            (root / part).is_dir() if part[-1] == "/" else (root / part).is_file() for part in parts
-        ):
-            return name
-    return None
+"""Reader of each dataset by name."""
 
 
 def open_dataset(root: Path, name: str, *, transfer: str = "auto") -> Dataset:
@@ -571,11 +548,11 @@ def open_dataset(root: Path, name: str, *, transfer: str = "auto") -> Dataset:
 
     Args:
         root: folder of the dataset.
-        name: a key of ``DATASETS``.
+        name: a key of ``READERS``.
         transfer: encoding of GNeRP's pictures; other datasets ignore it.
 
     Raises:
         PolarguideError: a file is missing, or the cameras are invalid.
     """
-    _, open_files = DATASETS[name]
+    open_files = READERS[name]
     return open_files(root, transfer=transfer) if open_files is open_gnerp else open_files(root)

@@ -13,14 +13,16 @@ import numpy as np
 import pytest
 from dataset_files import WRITERS, disc, write_npy
 from faults import Fault
-from test_bad_input import PLAIN, refused
+from refused_preparations import refused_in_one_line as refused
 from tiny_capture import write_picture
 
 from polarguide.capture.calibration import Calibration
 from polarguide.preparation.settings import PrepareSettings
+from polarguide_bench.datasets.readers import open_dataset
 
 # The light of these tests has no outlines: nothing tells the sense of NeRSP's and NeISF's angles.
 pytestmark = pytest.mark.filterwarnings("ignore:The sense of .* is uncertain")
+PLAIN = PrepareSettings(poses="none", gains="none")
 
 
 def npz(name: str, **changes: object) -> Callable[[Path], None]:
@@ -317,3 +319,21 @@ def test_poses_of_a_dataset_are_for_datasets(tmp_path: Path) -> None:
     write_mosaics(tmp_path / "in")
     settings = PrepareSettings(sensor="IMX250MYR", poses="dataset")
     assert "--poses: expected sfm, none" in refused(tmp_path / "in", tmp_path / "out", settings)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "fault"),
+    [
+        ("image_width", np.array([64, 64]), Fault(expected="in shape")),
+        ("image_width", np.inf, Fault(found="not finite")),
+        ("image_height", -48, Fault(expected="a size in pixels")),
+        ("extrinsics", np.full((4, 4, 4), np.nan), Fault(found="not finite")),
+        ("extrinsics", np.full((4, 4, 4), "x"), Fault(expected="complete .npz")),
+    ],
+)
+def test_cameras_of_phygap(tmp_path: Path, key: str, value: object, fault: Fault) -> None:
+    (tmp_path / "images_full").mkdir()
+    (tmp_path / "images_full" / "000.exr").touch()
+    whole = {"intrinsics": np.diag([90.0, 90, 1]), "extrinsics": np.stack([np.eye(4)]), "image_width": 64}
+    np.savez(tmp_path / "camera_params.npz", **{**whole, "image_height": 48, key: value})
+    fault.raised_by(open_dataset, tmp_path, "phygap")
