@@ -26,21 +26,21 @@ from polarguide.runs.health import METALS_PICTURE, report_metals
 from polarguide.runs.model import GaussianModel
 from polarguide.training.angles.polarizers import gaussian_training
 from polarguide.training.loop import TrainingLoop
+from polarguide.training.metals.hypotheses import LEVELS, Setting, dielectric_terms, metal_fit
 from polarguide.training.metals.observations import ViewSamples, contradicted, label_weights, shares
 from polarguide.training.metals.search import (
     GOLD,
     INFINITE,
-    LEVELS,
     SOFT_PRIORS,
     Graph,
     MetalEvidence,
     MetalSearch,
     _tint_cost,
     decide,
-    errors,
     evidence,
     looks,
     minimum_cut,
+    neighbor_graph,
     surfaces,
     unary,
     warn_of_unused_materials,
@@ -59,6 +59,18 @@ def found(
     return decide(measured_there, gaussians, torch.full((len(gaussians["means"]),), allowed), RULES)
 
 
+def samples_with(**given: Tensor) -> ViewSamples:
+    """Samples of equal weight of a single normal, without polarization but for what is given."""
+    s0 = given["s0"]
+    plain = {
+        "weight": torch.ones(s0.shape[:2]).to(s0),
+        "across": torch.zeros_like(s0),
+        "oblique": torch.zeros_like(s0),
+        "normal": torch.tensor([0.0, 0.0, 1.0]).to(s0).expand_as(s0),
+    }
+    return ViewSamples(**{**plain, **given})
+
+
 @pytest.mark.parametrize("material", [*METALS, *BODIES])
 def test_errors_are_those_of_fresnels_equations(material: str) -> None:
     """What a material shows leaves no error of its own explanation, in double precision, and one of the other."""
@@ -66,14 +78,16 @@ def test_errors_are_those_of_fresnels_equations(material: str) -> None:
     cosine = 0.35 + 0.6 * torch.rand(24, 40, generator=generator).double()
     light = 0.1 + torch.rand(24, 40, 1, generator=generator).double().expand(24, 40, 3)
     s0, across, _ = measured(material, cosine, light)
-    samples = ViewSamples(torch.ones(24, 40).double(), s0, across, torch.zeros_like(s0), cosine)
-    result = errors(samples, 1.5, 0.5, 0.02)
+    samples = samples_with(s0=s0, across=across, cosine=cosine)
+    setting = Setting(1.5, 0.5, 0.02)
+    metal = metal_fit(samples, setting)
+    dielectric = dielectric_terms(samples, setting).error()
     if material in METALS:
-        assert bool((result.metal < 0.2 * result.dielectric).all())
-        assert float((result.reflectance - torch.tensor(METALS[material])).abs().max()) < 0.2
+        assert bool((metal.error < 0.2 * dielectric).all())
+        assert float((metal.reflectance - torch.tensor(METALS[material])).abs().max()) < 0.2
     else:
-        assert float(result.dielectric.max()) < 1e-12
-        assert bool((result.metal > 100 * result.dielectric).all())
+        assert float(dielectric.max()) < 1e-12
+        assert bool((metal.error > 100 * dielectric).all())
 
 
 @pytest.mark.parametrize(("light", "metal_alone"), [(0.1, True), (50.0, False)])
@@ -82,12 +96,16 @@ def test_oblique_polarization_excuses_whom_it_can_come_from(light: float, metal_
     cosine = torch.full((6, 1), 0.7).double()
     s0 = torch.full((6, 1, 3), 0.5).double()
     oblique = 0.1 * s0
-    result = errors(ViewSamples(torch.ones(6, 1).double(), s0, 0.1 * s0, oblique, cosine), 1.5, light, 0.0)
-    assert float(result.metal) == 0  # the metal is off across the plane by less than what is at 45 degrees
+    samples = samples_with(s0=s0, across=0.1 * s0, oblique=oblique, cosine=cosine)
+    setting = Setting(1.5, light, 0.0)
+    dielectric = float(dielectric_terms(samples, setting).error())
+    assert (
+        float(metal_fit(samples, setting).error) == 0
+    )  # the metal is off across the plane by less than what is at 45 degrees
     s, p = reflectances_from_cosine(cosine[0], 1.5)
     most = float((s * p).sqrt()) * light
-    assert float(result.dielectric) >= 0.99 * max(0.0, 0.05 - most) ** 2 / 0.25
-    assert (float(result.dielectric) > 0) == metal_alone
+    assert dielectric >= 0.99 * max(0.0, 0.05 - most) ** 2 / 0.25
+    assert (dielectric > 0) == metal_alone
 
 
 def test_more_oblique_polarization_than_a_metal_keeps_is_an_error() -> None:
@@ -95,11 +113,12 @@ def test_more_oblique_polarization_than_a_metal_keeps_is_an_error() -> None:
     cosine = torch.full((6, 1), math.cos(math.radians(70))).double()
     s0 = torch.full((6, 1, 3), 0.5).double()
     oblique = 0.95 * s0
-    result = errors(ViewSamples(torch.ones(6, 1).double(), s0, 0.1 * s0, oblique, cosine), 1.5, 0.1, 0.0)
+    samples = samples_with(s0=s0, across=0.1 * s0, oblique=oblique, cosine=cosine)
+    metal = metal_fit(samples, Setting(1.5, 0.1, 0.0))
     index = optics.conductor_index(torch.tensor(LEVELS).double())
     largest = float(optics.conductor_oblique_share(cosine[0], *index).abs().max())
     assert largest < 0.9
-    assert float(result.metal) >= 0.99 * (0.95 - largest) ** 2
+    assert float(metal.error) >= 0.99 * (0.95 - largest) ** 2
 
 
 @pytest.mark.parametrize("degree", [0.0, 0.2, 0.4, 0.6])
@@ -195,6 +214,21 @@ def test_no_metal_is_more_deeply_colored_than_gold(weakest: float, costs: bool) 
     cost = _tint_cost(colors, weight, RULES)
     assert (float(cost[0]) > 0.5) == costs
     assert not bool(cost[1:].any())
+
+
+def test_a_border_between_two_hues_is_cheaper_than_between_two_brightnesses() -> None:
+    """Neighbors differ by a factor of two: at one place only in the blue, elsewhere in all colors."""
+    ball = gaussians_of_the_ball()
+    count = len(ball["means"])
+    color = torch.full((count, 3), 0.4)
+    color[::2] *= 0.5
+    hue = color.clone()
+    hue[0, 2] = 2 * hue[0, 2]
+    costs = []
+    for colors in (color, hue):
+        graph = neighbor_graph(ball, said(count, color=colors), RULES)
+        costs.append(graph.cost[graph.first == 0].sum())
+    assert costs[1] < 0.2 * costs[0]
 
 
 def test_what_priors_decide_differently_is_a_mixture() -> None:

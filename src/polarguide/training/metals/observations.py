@@ -37,6 +37,7 @@ class ViewSamples(NamedTuple):
         across: [V, N, 3] mean polarization P across the plane of incidence.
         oblique: [V, N, 3] mean polarization at 45 degrees to that plane.
         cosine: [V, N] mean cosine of the zenith angle.
+        normal: [V, N, 3] mean rendered normal, in world axes.
     """
 
     weight: Tensor
@@ -44,6 +45,7 @@ class ViewSamples(NamedTuple):
     across: Tensor
     oblique: Tensor
     cosine: Tensor
+    normal: Tensor
 
 
 def evenly(views: Sequence[View], most: int) -> Sequence[View]:
@@ -62,10 +64,10 @@ def shares(gaussians: Parameters, camera: Camera, target: Tensor, rasterize: Ras
 
 
 def view_sums(gaussians: Parameters, view: View, rasterize: Rasterize, least_normal: float) -> Tensor:
-    """Return sums [N, 11] over the pixels of each Gaussian in a view, which has to determine the Stokes vector.
+    """Return sums [N, 14] over the pixels of each Gaussian in a view, which has to determine the Stokes vector.
 
     ``samples_of`` converts these sums to means. The columns are 1, S0 (three colors), P (three), the polarization at 45
-    degrees (three), and the cosine of the zenith.
+    degrees (three), the cosine of the zenith, and the normal in world axes (three).
     """
     device = gaussians["means"].device
     normal = render(gaussians, view.camera, rasterize, RenderRequest(sh_degree=0)).normal
@@ -83,7 +85,9 @@ def view_sums(gaussians: Parameters, view: View, rasterize: Rasterize, least_nor
     oblique = s2 * cosine2 - s1 * sine
     one = torch.ones_like(x)[..., None]
     good = (reliable & ~(view.invalid | view.saturated))[..., None]
-    target = torch.cat((one, s0, across, oblique, -dot(guide, rays)[..., None]), dim=-1) * good
+    cosine = -dot(guide, rays)[..., None]
+    columns = (one, s0, across, oblique, cosine, view.camera.to_world(guide))
+    target = torch.cat(columns, dim=-1) * good
     return shares(gaussians, view.camera, target.contiguous(), rasterize)
 
 
@@ -95,7 +99,14 @@ def samples_of(looks: Sequence[Tensor], which: slice, limits: MetalViews) -> Vie
     cosine = means[..., 9].clamp(0, 1)
     counts = weight > limits.least_share * weight.amax(dim=0)
     counts &= (cosine > limits.cosines[0]) & (cosine < limits.cosines[1])
-    return ViewSamples(weight * counts, means[..., :3], means[..., 3:6], means[..., 6:9], cosine)
+    return ViewSamples(
+        weight=weight * counts,
+        s0=means[..., :3],
+        across=means[..., 3:6],
+        oblique=means[..., 6:9],
+        cosine=cosine,
+        normal=means[..., 10:13],
+    )
 
 
 @torch.no_grad()

@@ -10,19 +10,7 @@ measures S0 and two components of polarization for each color. P is the polariza
 the rendered normal, and U is the polarization at 45 degrees to this plane. ``rho`` are Fresnel's degrees of
 polarization.
 
-- The diffuse light d of a dielectric is the same in all views, and its specular light s is unknown in each view:
-  ``S0 = d + s``, ``P = k rho_s s - rho_d d``. Roughness reduces the specular polarization by a factor k in ``ROUGH``.
-- A metal mirrors unknown light and polarizes it according to its reflectance r: ``P = rho(r) S0``. Its color is the
-  color of the mirrored light times r, so r is derived from the observed color.
-
-Unpolarized light has no U. Polarized light changes P about as much as U. A metal preserves at most the share
-``conductor_oblique_share`` of U (aluminum 0.98 at 45 degrees and 0.91 at 60; copper and gold 0.57 at 60 and 0.1 at 70).
-A dielectric preserves at most ``sqrt(Rs Rp)`` times the light of the scene. Under each hypothesis, the explained part
-of U reduces the error in P, and the rest of U is added as an error.
-
-The errors E are mean squares relative to the light, over n views of unknown variance. With e the typical error of the
-scene, a lower bound of all errors, the log likelihood ratio is ``n log((e^2 + E_dielectric) / (e^2 + E_metal))``. P and
-U contribute n/2 each.
+``training.metals.hypotheses`` computes this ratio.
 """
 
 from __future__ import annotations
@@ -41,7 +29,6 @@ from scipy.sparse.csgraph import breadth_first_order, connected_components, maxi
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from polarguide import optics
 from polarguide.capture import View
 from polarguide.capture.view import listed
 from polarguide.core.system import UNBOUNDED, MemoryBound
@@ -49,15 +36,21 @@ from polarguide.gaussians.gaussians import Gaussians
 from polarguide.gaussians.geometry import shortest_axis_normals
 from polarguide.gaussians.initialize import far_away
 from polarguide.geometry.vectors import dot
-from polarguide.optics.fresnel import reflectances_from_cosine
 from polarguide.raster import Rasterize
 from polarguide.shading.gbuffer import render
 from polarguide.shading.metal import FIRST_REFLECTANCE, become_metal
 from polarguide.shading.model import Light, Parameters, ShadingModel, radiance_cubemap
 from polarguide.training.context import TrainingContext, TrainingState
+from polarguide.training.metals.hypotheses import (
+    UNKNOWNS,
+    DielectricTerms,
+    Setting,
+    dielectric_terms,
+    log_ratio,
+    metal_fit,
+)
 from polarguide.training.metals.observations import (
     LEAST_PIXELS,
-    ViewSamples,
     contradicted,
     evenly,
     label_weights,
@@ -68,33 +61,10 @@ from polarguide.training.metals.observations import (
 from polarguide.training.recipe import MetalRules, MetalViews, Recipe, Schedule
 from polarguide.training.settings import ResolvedSettings
 
-ROUGH = (1.0, 0.85, 0.7, 0.55)
-"""Tested shares of the specular polarization that remain on a rough dielectric."""
-LEVELS = (0.5, 0.6, 0.7, 0.8, 0.88, 0.95)
-"""Levels of the tested reflectances. A tested reflectance is a level times a power of the observed color."""
-POWERS = (0.5, 0.75, 1.0)
-"""Powers of the observed color in the tested reflectances."""
 GOLD = 0.38
 """Smallest over largest reflectance of gold, the most deeply colored metal."""
-UNKNOWNS = 2
-"""Number of unknowns of each hypothesis. As many views are needed to determine the unknowns, and give no evidence."""
-NOISE = 1e-4
-"""Lower bound of the typical error of a scene, which is the mean square of the noise relative to the light."""
 CHUNK = 1 << 14
 """Batch size in Gaussians, which bounds the memory of intermediate tensors."""
-
-
-class Errors(NamedTuple):
-    """Errors of the two hypotheses, dielectric and metal, for N Gaussians.
-
-    Attributes:
-        dielectric, metal: [N] mean squared errors relative to the light.
-        reflectance: [N, 3] reflectance of the metal with the smallest error.
-    """
-
-    dielectric: Tensor
-    metal: Tensor
-    reflectance: Tensor
 
 
 class MetalEvidence(NamedTuple):
@@ -113,58 +83,6 @@ class MetalEvidence(NamedTuple):
     reflectance: Tensor
     color: Tensor
     labels: Tensor
-
-
-def errors(samples: ViewSamples, refractive_index: float, light: float, dark: float) -> Errors:
-    """Return the errors of both hypotheses for N Gaussians.
-
-    Args:
-        samples: means over the views.
-        refractive_index: refractive index of dielectrics.
-        light: mean radiance of the scene, S0.
-        dark: radiance that is added to the denominator of relative errors.
-    """
-    s0 = samples.s0
-    across = samples.across
-    cosine = samples.cosine[..., None]
-    sine2 = 1 - cosine * cosine
-    above = s0.clamp(min=0) + dark  # the variance of photon counts grows with the light
-    weight = samples.weight[..., None] / above
-    scale = (weight * above * above).sum(dim=0).clamp(min=1e-9)
-
-    def mean(square: Tensor) -> Tensor:
-        return ((weight * square).sum(dim=0) / scale).mean(dim=1)
-
-    specular, diffuse = (slope * sine2 for slope in optics.dolp_slopes(cosine, refractive_index))
-    bodies = []
-    for left in ROUGH:
-        over = left * specular
-        by_line = weight / (1 + over * over)
-        of_body = over + diffuse
-        excess = over * s0 - across
-        body = (by_line * of_body * excess).sum(dim=0) / (by_line * of_body**2).sum(dim=0).clamp(min=1e-9)
-        bodies.append(mean((excess - of_body * body.clamp(min=0)) ** 2 / (1 + over * over)))
-    color = (samples.weight[..., None] * s0).sum(dim=0)
-    color = (color / color.amax(dim=1, keepdim=True).clamp(min=1e-6)).clamp(min=0.05)
-    oblique = mean(samples.oblique**2)
-
-    def excused(error: Tensor, largest: Tensor) -> Tensor:
-        """Reduce an error by the part of U, up to ``largest``, that the hypothesis explains; add the excess of U."""
-        beyond = mean((samples.oblique.abs() - largest).clamp(min=0) ** 2)
-        return (error - (oblique - beyond).clamp(min=0)).clamp(min=0) + beyond
-
-    metals = []
-    tried = [level * color**power for power in POWERS for level in LEVELS]
-    for reflectance in tried:
-        n, k = optics.conductor_index(reflectance)
-        degree = optics.conductor_dolp_slope(cosine, n, k) * sine2
-        error = mean((across - degree * s0) ** 2 / (1 + degree * degree))
-        metals.append(excused(error, optics.conductor_oblique_share(cosine, n, k).abs() * s0.clamp(min=0)))
-    metal, chosen = torch.stack(metals).min(dim=0)
-    s, p = reflectances_from_cosine(cosine, refractive_index)
-    dielectric = excused(torch.stack(bodies).amin(dim=0), (s * p).sqrt() * light)
-    best = torch.stack(tried)[chosen, torch.arange(len(chosen), device=chosen.device)]
-    return Errors(dielectric, metal, best)
 
 
 @torch.no_grad()
@@ -188,32 +106,38 @@ def evidence(
         gray = labels.new_full((len(labels), 3), FIRST_REFLECTANCE)
         return MetalEvidence(none, none, gray, torch.zeros_like(gray), labels)
     looks = [view_sums(gaussians, view, rasterize, limits.least_normal) for view in memory.between(measured)]
-    result = of_views(looks, labels, refractive_index, rules, limits)
+    result = of_views(looks, labels, neighbors_of(gaussians), refractive_index, rules, limits)
     del looks
     memory.clear()
     return result
 
 
 def of_views(
-    looks: Sequence[Tensor], labels: Tensor, refractive_index: float, rules: MetalRules, limits: MetalViews
+    looks: Sequence[Tensor],
+    labels: Tensor,
+    neighbors: Tensor,
+    refractive_index: float,
+    rules: MetalRules,
+    limits: MetalViews,
 ) -> MetalEvidence:
-    """Compute the evidence from the sums of ``view_sums`` and the labels of the user."""
+    """Compute the evidence from the sums of ``view_sums``, the labels of the user, and neighbors [N, K]."""
     sums = torch.stack([look.sum(dim=0) for look in looks]).sum(dim=0)
-    light = float(sums[1:4].mean() / sums[0].clamp(min=1e-6))
+    setting = Setting(refractive_index, float(sums[1:4].mean() / sums[0].clamp(min=1e-6)), limits.dark)
     parts = []
     for begin in range(0, len(labels), CHUNK):
         samples = samples_of(looks, slice(begin, begin + CHUNK), limits)
         total = samples.weight.sum(dim=0)
         count = total * total / (samples.weight**2).sum(dim=0).clamp(min=1e-9) * (total > LEAST_PIXELS)
         color = (samples.weight[..., None] * samples.s0).sum(dim=0) / total.clamp(min=1e-6)[:, None]
-        parts.append((*errors(samples, refractive_index, light, limits.dark), count, color, total))
-    dielectric, metal, reflectance, count, color, total = (
+        terms = dielectric_terms(samples, setting)
+        parts.append((*metal_fit(samples, setting), count, color, total, *terms))
+    metal, reflectance, count, color, total, *columns = (
         torch.cat(values) for values in zip(*parts, strict=True)
     )
-    typical = torch.minimum(dielectric, metal)[count > UNKNOWNS]
-    error = typical.median().clamp(min=NOISE) if len(typical) else dielectric.new_tensor(1.0)
-    ratio = ((error + dielectric) / (error + metal)).log() - _tint_cost(color, total, rules)
-    return MetalEvidence(ratio, (count - UNKNOWNS).clamp(min=0), reflectance, color.clamp(min=0), labels)
+    views = (count - UNKNOWNS).clamp(min=0)
+    nats = log_ratio(metal, DielectricTerms(*columns), views, neighbors)
+    ratio = nats / views.clamp(min=1e-6) - _tint_cost(color, total, rules)
+    return MetalEvidence(ratio, views, reflectance, color.clamp(min=0), labels)
 
 
 def _tint_cost(color: Tensor, weight: Tensor, rules: MetalRules) -> Tensor:
@@ -233,6 +157,8 @@ PER_NAT = 100
 """Capacity of one nat in the minimum cut, which requires integer capacities."""
 INFINITE = 1e5
 """Evidence of a label, in nats, which exceeds all other evidence."""
+LEAST_DIFFERENCE = 1e-6
+"""Least variance of color differences. It keeps the covariance of a gray scene invertible."""
 DARK = 0.02
 """Radiance (full scale is 1) that is added to colors before their comparison."""
 
@@ -250,25 +176,34 @@ class Graph(NamedTuple):
     cost: NDArray[np.float64]
 
 
+def neighbors_of(gaussians: Parameters) -> Tensor:
+    """Return the indices [N, K] of the nearest neighbors of each Gaussian, at most ``NEIGHBORS``."""
+    means = gaussians["means"].detach()
+    places = means.cpu().double().numpy()
+    count = min(NEIGHBORS + 1, len(places))
+    indices = torch.from_numpy(cKDTree(places).query(places, k=count)[1])
+    return indices.reshape(len(places), count)[:, 1:].to(means.device)
+
+
 def neighbor_graph(gaussians: Parameters, measured: MetalEvidence, rules: MetalRules) -> Graph:
     """Connect each Gaussian to its nearest neighbors, with costs by the similarity of normals and colors.
 
-    Color differences are relative to the root mean square difference of neighbors in the scene.
+    Color differences are Mahalanobis distances: they are relative to the covariance of the differences of neighbors in
+    the scene. Neighbors differ more in brightness than in hue, so that a border between two hues is cheap.
     """
     means = gaussians["means"].detach()
     axes = shortest_axis_normals(
         means, gaussians["quaternions"], gaussians["log_scales"], means.new_zeros(3), None
     )
-    places = means.cpu().double().numpy()
-    count = min(NEIGHBORS + 1, len(places))
-    neighbors = torch.from_numpy(cKDTree(places).query(places, k=count)[1]).reshape(len(places), count)[:, 1:]
-    neighbors = neighbors.to(means.device)
+    neighbors = neighbors_of(gaussians)
     logarithms = (measured.color + DARK).log()
-    differences = (logarithms[neighbors] - logarithms[:, None]).square().mean(dim=-1)
-    visible = measured.views > 0
-    typical = (differences.mean(dim=1) * visible).sum() / visible.sum().clamp(min=1)
-    alike = dot(axes[:, None], axes[neighbors]) ** 4 * torch.exp(-0.5 * differences / typical.clamp(min=1e-6))
-    first = np.repeat(np.arange(len(places)), count - 1)
+    differences = (logarithms[neighbors] - logarithms[:, None]).double()
+    sampled = differences[measured.views > 0].flatten(0, 1)
+    covariance = sampled.T @ sampled / max(len(sampled), 1)
+    covariance += LEAST_DIFFERENCE * torch.eye(3).to(covariance)
+    distances = (differences @ torch.linalg.inv(covariance) * differences).sum(dim=-1)
+    alike = dot(axes[:, None], axes[neighbors]) ** 4 * torch.exp(-0.5 * distances)
+    first = np.repeat(np.arange(len(means)), neighbors.shape[1])
     # A pair of mutual neighbors appears twice.
     return Graph(
         first, neighbors.cpu().numpy().ravel(), (0.5 * rules.likeness * alike).cpu().double().numpy().ravel()
