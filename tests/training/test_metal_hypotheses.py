@@ -15,11 +15,13 @@ from polarguide.training.metals.hypotheses import (
     ROUGH,
     TURN,
     DielectricTerms,
+    SceneLight,
     Setting,
     VariancePrior,
     dielectric_fit,
     dielectric_terms,
     log_ratio,
+    scene_light,
     variance_prior,
 )
 from polarguide.training.metals.observations import ViewSamples, samples_of, view_sums
@@ -195,3 +197,35 @@ def test_each_gaussian_gets_the_normals_of_its_pixels() -> None:
 def test_surfaces_in_too_few_views_give_no_evidence() -> None:
     views = torch.tensor([0.0, 0.3, 0.0])
     assert not bool(ratio_of(torch.ones(3), 0.1 * torch.ones(3), views).any())
+
+
+def test_the_light_of_a_scene_is_the_distribution_of_all_its_pixels() -> None:
+    generator = torch.Generator().manual_seed(3)
+    pictures = [torch.rand(count, 3, generator=generator) for count in (40, 7)]
+    light = scene_light(pictures, dark=0.02)
+    logarithms = np.log(
+        np.concatenate([picture.double().numpy().mean(axis=1) for picture in pictures]) + 0.02
+    )
+    assert light.mean == pytest.approx(logarithms.mean(), rel=1e-6)
+    assert light.spread == pytest.approx(logarithms.std(), rel=1e-5)
+    even = scene_light([torch.full((5, 3), 0.5)], dark=0.0)
+    assert 0 < even.spread < 0.05
+
+
+def test_a_metal_in_front_of_dark_light_costs_the_square_of_its_distance() -> None:
+    mean, spread = math.log(0.2), 0.6
+    light = SceneLight(mean, spread, dark=0.0)
+    reflectance = torch.tensor([[0.5, 0.5, 0.5], [0.9, 0.5, 0.1], [0.5, 0.5, 0.5]]).double()
+    mirrored = torch.tensor([-2.0, -1.0, 3.0]).double()  # standard deviations
+    s0 = 0.5 * torch.exp(mean + spread * mirrored)[:, None].expand(-1, 3)
+    changes = torch.exp(torch.tensor([-0.3, 0.0, 0.3]).double())
+    views = len(changes)
+    samples = ViewSamples(
+        weight=torch.ones(views, 3).double(),
+        s0=changes[:, None, None] * s0,
+        across=torch.zeros(views, 3, 3).double(),
+        oblique=torch.zeros(views, 3, 3).double(),
+        cosine=torch.full((views, 3), 0.7).double(),
+        normal=torch.zeros(views, 3, 3).double(),
+    )
+    assert light.cost(samples, reflectance).tolist() == pytest.approx([2.0, 0.5, 0.0], abs=1e-9)

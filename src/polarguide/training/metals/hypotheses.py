@@ -15,6 +15,11 @@ Unpolarized light has no U. Polarized light changes P about as much as U. A meta
 A dielectric preserves at most ``sqrt(Rs Rp)`` times the light of the scene. Under each hypothesis, the explained part
 of U reduces the error in P, and the rest of U is added as an error.
 
+**Brightness.** A metal mirrors light of the scene, so that observed color over reflectance has the brightness of the
+scene. The logarithm of its brightness is normal, with the mean and the variance of all pixels of the pictures. A metal
+in front of much darker light is unlikely, such as black rubber, whose weak gloss resembles that of a rough metal. A
+metal in front of brighter light is not, because lamps may be outside of the pictures.
+
 **Diffuse light.** With the mean normal ``n'`` of all views, the diffuse light is ``d (1 + h (n - n'))``. The relative
 gradient h belongs to the illumination, so that a Gaussian and its neighbors share it. Its prior is Gaussian with the
 standard deviation ``TURN``. h is integrated out: its best value leaves the error, and the share of each Gaussian in
@@ -30,6 +35,7 @@ E_metal))`` (Smyth 2004, "Linear models and empirical Bayes methods", Statistica
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -57,7 +63,8 @@ UNKNOWNS = 2
 NOISE = 1e-4
 """Mean square of the noise of a camera relative to the light. Smaller errors count as this error in the prior."""
 LEAST_SPREAD = 1e-3
-"""Least variance of the logarithms of error variances. It limits the weight of the prior to 2,000 observations."""
+"""Least variance of logarithms: of error variances and of radiance. For error variances, it limits the weight of the
+prior to 2,000 observations."""
 
 
 class Setting(NamedTuple):
@@ -72,6 +79,47 @@ class Setting(NamedTuple):
     refractive_index: float
     light: float
     dark: float
+
+
+class SceneLight(NamedTuple):
+    """Distribution of the logarithm of the radiance in all pixels of a scene's pictures.
+
+    Attributes:
+        mean: mean of ``log(S0 + dark)``; S0 is the mean over the colors.
+        spread: its standard deviation.
+        dark: radiance that is added before the logarithm.
+    """
+
+    mean: float
+    spread: float
+    dark: float
+
+    def cost(self, samples: ViewSamples, reflectance: Tensor) -> Tensor:
+        """Return the cost [N] of metals with reflectance [N, 3] in front of too dark light, in nats per view."""
+        logarithms = log_radiance(samples.s0, self.dark)
+        observed = (samples.weight * logarithms).sum(dim=0) / samples.weight.sum(dim=0).clamp(min=1e-6)
+        mirrored = observed - reflectance.mean(dim=-1).log()
+        return 0.5 * ((self.mean - mirrored) / self.spread).clamp(min=0) ** 2
+
+
+def log_radiance(s0: Tensor, dark: float) -> Tensor:
+    """Return the logarithm of radiance [..., 3], mean over the colors, after ``dark`` is added."""
+    return (s0.mean(dim=-1).clamp(min=0) + dark).log()
+
+
+def scene_light(pictures: Iterable[Tensor], dark: float) -> SceneLight:
+    """Measure the distribution of the radiance S0 over pixels.
+
+    Args:
+        pictures: radiance S0 of the valid pixels of each picture, [P, 3].
+        dark: radiance that is added before the logarithm.
+    """
+    moments = torch.zeros(3, dtype=torch.float64)
+    for s0 in pictures:
+        logarithms = log_radiance(s0, dark).double().cpu()
+        moments += torch.stack([logarithms**power for power in range(3)]).sum(dim=1)
+    mean, square = (float(moment / moments[0].clamp(min=1)) for moment in moments[1:])
+    return SceneLight(mean, math.sqrt(max(square - mean * mean, LEAST_SPREAD)), dark)
 
 
 class MetalFit(NamedTuple):

@@ -53,6 +53,11 @@ def evenly(views: Sequence[View], most: int) -> Sequence[View]:
     return views[:: max(1, -(-len(views) // most))]
 
 
+def valid_radiance(view: View) -> Tensor:
+    """Return the radiance S0 of the valid pixels of a view, [P, 3]."""
+    return 2 * view.photograph()[~(view.invalid | view.saturated)]
+
+
 def shares(gaussians: Parameters, camera: Camera, target: Tensor, rasterize: Rasterize) -> Tensor:
     """Return, for each Gaussian, the sum of a picture [H, W, C] weighted by its blending weights, [N, C]."""
     with torch.no_grad():

@@ -44,10 +44,12 @@ from polarguide.training.context import TrainingContext, TrainingState
 from polarguide.training.metals.hypotheses import (
     UNKNOWNS,
     DielectricTerms,
+    SceneLight,
     Setting,
     dielectric_terms,
     log_ratio,
     metal_fit,
+    scene_light,
 )
 from polarguide.training.metals.observations import (
     LEAST_PIXELS,
@@ -56,6 +58,7 @@ from polarguide.training.metals.observations import (
     label_weights,
     numbers_in,
     samples_of,
+    valid_radiance,
     view_sums,
 )
 from polarguide.training.recipe import MetalRules, MetalViews, Recipe, Schedule
@@ -106,7 +109,8 @@ def evidence(
         gray = labels.new_full((len(labels), 3), FIRST_REFLECTANCE)
         return MetalEvidence(none, none, gray, torch.zeros_like(gray), labels)
     looks = [view_sums(gaussians, view, rasterize, limits.least_normal) for view in memory.between(measured)]
-    result = of_views(looks, labels, neighbors_of(gaussians), refractive_index, rules, limits)
+    light = scene_light(map(valid_radiance, memory.between(measured)), limits.dark)
+    result = of_views(looks, light, labels, neighbors_of(gaussians), refractive_index, rules, limits)
     del looks
     memory.clear()
     return result
@@ -114,13 +118,14 @@ def evidence(
 
 def of_views(
     looks: Sequence[Tensor],
+    light: SceneLight,
     labels: Tensor,
     neighbors: Tensor,
     refractive_index: float,
     rules: MetalRules,
     limits: MetalViews,
 ) -> MetalEvidence:
-    """Compute the evidence from the sums of ``view_sums``, the labels of the user, and neighbors [N, K]."""
+    """Compute the evidence from sums of ``view_sums``, the scene's light, the user's labels, and neighbors [N, K]."""
     sums = torch.stack([look.sum(dim=0) for look in looks]).sum(dim=0)
     setting = Setting(refractive_index, float(sums[1:4].mean() / sums[0].clamp(min=1e-6)), limits.dark)
     parts = []
@@ -130,13 +135,15 @@ def of_views(
         count = total * total / (samples.weight**2).sum(dim=0).clamp(min=1e-9) * (total > LEAST_PIXELS)
         color = (samples.weight[..., None] * samples.s0).sum(dim=0) / total.clamp(min=1e-6)[:, None]
         terms = dielectric_terms(samples, setting)
-        parts.append((*metal_fit(samples, setting), count, color, total, *terms))
-    metal, reflectance, count, color, total, *columns = (
+        fit = metal_fit(samples, setting)
+        dark = light.cost(samples, fit.reflectance)
+        parts.append((*fit, dark, count, color, total, *terms))
+    metal, reflectance, dark, count, color, total, *columns = (
         torch.cat(values) for values in zip(*parts, strict=True)
     )
     views = (count - UNKNOWNS).clamp(min=0)
     nats = log_ratio(metal, DielectricTerms(*columns), views, neighbors)
-    ratio = nats / views.clamp(min=1e-6) - _tint_cost(color, total, rules)
+    ratio = nats / views.clamp(min=1e-6) - _tint_cost(color, total, rules) - dark
     return MetalEvidence(ratio, views, reflectance, color.clamp(min=0), labels)
 
 
