@@ -223,7 +223,9 @@ def test_the_tone_curve_is_set_printed_and_removed(
 ) -> None:
     assert present(copy, "--tone-curve", "soft") == Presentation(tone_curve="soft")
     assert "tone curve: soft" in capsys.readouterr().out
-    assert "--tone-curve: expected none or soft, found hard" in refused("present", copy, "--tone-curve", "hard")
+    assert "--tone-curve: expected none or soft, found hard" in refused(
+        "present", copy, "--tone-curve", "hard"
+    )
     assert read_presentation(copy) == Presentation(tone_curve="soft")
     assert present(copy, "--tone-curve", "none") == Presentation()
 

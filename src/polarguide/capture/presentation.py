@@ -40,8 +40,6 @@ STOPS = 8.0
 """Largest change of the exposure in stops, brighter or darker."""
 KNEE = 0.5
 """Displayed linear value above which the tone curve compresses. Half of full scale keeps mid-tones unchanged."""
-BRIGHTEST = 1e30
-"""Limit of values in the tone curve. Their reciprocals are normal numbers in single precision."""
 
 Vector = tuple[float, float, float]
 Gain = Annotated[float, Meta(ge=0.02, le=50)]
@@ -331,7 +329,7 @@ def tone_mapped(linear: Tensor, tone_curve: ToneCurve | None) -> Tensor:
     """
     if tone_curve is None:
         return linear
-    finite = linear.nan_to_num(0.0).clamp(max=BRIGHTEST)
+    finite = linear.nan_to_num(0.0)
     largest = finite.amax(dim=-1, keepdim=True).clamp(min=KNEE)
     mapped = 1 - (1 - KNEE) ** 2 / (largest + 1 - 2 * KNEE)
     return finite * (mapped / largest)

@@ -18,9 +18,8 @@ const float MAXIMUM_LOG = 5.0;
 
 // The tone curve of capture/presentation.py.
 const float KNEE = 0.5;
-const float BRIGHTEST = 1e30;
 vec3 toneMapped(vec3 linear) {
-  vec3 v = min(linear, BRIGHTEST);
+  vec3 v = min(linear, 1e30); // infinity times 0 is not a number
   float largest = max(max(max(v.r, v.g), v.b), KNEE);
   float mapped = 1.0 - (1.0 - KNEE) * (1.0 - KNEE) / (largest + 1.0 - 2.0 * KNEE);
   return v * (mapped / largest);
