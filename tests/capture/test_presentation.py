@@ -21,7 +21,7 @@ from polarguide.capture.presentation import (
     parse_length,
     read_presentation,
     shown_length,
-    tone_mapped,
+    with_tone_curve,
     write_presentation,
 )
 from polarguide.geometry.scene_frame import scene_frame
@@ -141,7 +141,7 @@ def test_white_balance_is_a_factor_on_light() -> None:
 def gray(values: np.ndarray) -> np.ndarray:
     """The soft tone curve of gray pixels with the values."""
     pixels = torch.from_numpy(values)[:, None].expand(-1, 3)
-    mapped = tone_mapped(pixels, "soft")
+    mapped = with_tone_curve(pixels, "soft")
     assert mapped.dtype == pixels.dtype
     assert bool((mapped == mapped[:, :1]).all())
     return mapped[:, 0].numpy()
@@ -155,7 +155,7 @@ def test_the_tone_curve_agrees_with_a_reference_in_double_precision() -> None:
     compressed = 1 - (1 - KNEE) ** 2 / (largest + 1 - 2 * KNEE)
     expected = exact * np.where(largest <= KNEE, 1, compressed / largest)
     assert 100 < int((largest <= KNEE).sum()) < 900
-    np.testing.assert_allclose(tone_mapped(linear, "soft").numpy(), expected, rtol=1e-6)
+    np.testing.assert_allclose(with_tone_curve(linear, "soft").numpy(), expected, rtol=1e-6)
 
 
 def test_the_tone_curve_is_smooth_at_the_knee_rises_and_approaches_white() -> None:
@@ -174,7 +174,7 @@ def test_the_tone_curve_is_smooth_at_the_knee_rises_and_approaches_white() -> No
 
 def test_the_tone_curve_keeps_the_hue() -> None:
     linear = torch.tensor([[4.0, 1.0, 0.0], [0.25, 8.0, 2.0]], dtype=torch.float64)
-    mapped = tone_mapped(linear, "soft")
+    mapped = with_tone_curve(linear, "soft")
     torch.testing.assert_close(
         mapped / mapped.amax(dim=1, keepdim=True), linear / linear.amax(dim=1, keepdim=True)
     )
@@ -185,7 +185,7 @@ def test_the_tone_curve_makes_no_nan(dtype: torch.dtype) -> None:
     most = torch.finfo(dtype).max
     values = [math.nan, math.inf, -math.inf, most, -most, -2.0, 0.0, 3.0]
     pixels = torch.cartesian_prod(*3 * [torch.tensor(values, dtype=dtype)])
-    mapped = tone_mapped(pixels, "soft")
+    mapped = with_tone_curve(pixels, "soft")
     assert bool(mapped.isfinite().all())
     assert float(mapped.max()) == pytest.approx(1)
     assert bool((mapped.sign() == pixels.nan_to_num(0.0).sign())[~pixels.isinf().any(dim=1)].all())
@@ -196,5 +196,5 @@ def test_display_applies_color_and_then_the_tone_curve() -> None:
     bright = Presentation(exposure=2.0)
     assert torch.equal(bright.displayed(light), 4 * light)
     curved = Presentation(exposure=2.0, tone_curve="soft")
-    assert torch.equal(curved.displayed(light), tone_mapped(4 * light, "soft"))
-    assert tone_mapped(light, None) is light
+    assert torch.equal(curved.displayed(light), with_tone_curve(4 * light, "soft"))
+    assert with_tone_curve(light, None) is light

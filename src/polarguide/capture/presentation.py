@@ -144,7 +144,7 @@ class Presentation(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit
         white_balance: factors by which linear R, G and B are multiplied for display, 0.02 to 50.
         chart: correction by a color chart, which is an alternative to a white balance.
         exposure: change of the displayed brightness in stops, -8 to 8.
-        tone_curve: ``soft`` compresses highlights smoothly, see ``tone_mapped``; default: highlights are clipped.
+        tone_curve: ``soft`` compresses highlights smoothly, see ``with_tone_curve``; default: highlights are clipped.
         up_axis: up direction in the axes of the scene, a vector of any length, [3]; default: that of the cameras.
         meters_per_unit: length of the scene's unit in meters.
         crop: box that limits the displayed and exported part of the scene.
@@ -205,7 +205,7 @@ class Presentation(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit
 
     def displayed(self, radiance: Tensor) -> Tensor:
         """Convert linear radiance [..., 3] of the camera to displayed linear sRGB with the color and the tone curve."""
-        return tone_mapped(colored(radiance, self.color), self.tone_curve)
+        return with_tone_curve(colored(radiance, self.color), self.tone_curve)
 
     def over(self, other: Presentation) -> Presentation:
         """Return this presentation, in which missing fields are filled with the fields of another presentation.
@@ -314,7 +314,7 @@ def colored(radiance: Tensor, color: Tensor | None) -> Tensor:
     return radiance if color is None else (radiance @ color.T.to(radiance)).clamp(min=0)
 
 
-def tone_mapped(linear: Tensor, tone_curve: ToneCurve | None) -> Tensor:
+def with_tone_curve(linear: Tensor, tone_curve: ToneCurve | None) -> Tensor:
     """Apply a tone curve to displayed linear sRGB, [..., 3] to [..., 3].
 
     The curve ``soft`` maps the largest channel x of a pixel to ``x`` up to the knee k (``KNEE``), and above to

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from polarguide import optics
 from polarguide.capture import View
-from polarguide.capture.presentation import UNCHANGED, Presentation, colored, tone_mapped
+from polarguide.capture.presentation import UNCHANGED, Presentation, colored, with_tone_curve
 from polarguide.core.files import write_whole
 from polarguide.geometry.camera import Camera
 from polarguide.optics.color import shown
@@ -431,7 +431,7 @@ def layer_picture(
         values = colored(values, presentation.color)
         if exposed:
             values = values * clipping_exposure(values)
-        return radiance_to_rgb(tone_mapped(values, presentation.tone_curve))
+        return radiance_to_rgb(with_tone_curve(values, presentation.tone_curve))
     if name == "depth":
         there = result.alpha > 0.5
         return depth_picture(torch.where(there, values, 0.0), depths or depth_range(values, there))
