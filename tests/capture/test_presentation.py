@@ -6,12 +6,14 @@ import json
 import math
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from faults import Fault
 from random_runs import ring
 
 from polarguide.capture.presentation import (
+    KNEE,
     PRESENTATION_FILE,
     Crop,
     Presentation,
@@ -19,6 +21,7 @@ from polarguide.capture.presentation import (
     parse_length,
     read_presentation,
     shown_length,
+    with_tone_curve,
     write_presentation,
 )
 from polarguide.geometry.scene_frame import scene_frame
@@ -26,6 +29,7 @@ from polarguide.geometry.scene_frame import scene_frame
 AROUND = scene_frame(list(ring().values()))
 WHOLE = Presentation(
     white_balance=(1.5, 1.0, 0.75),
+    tone_curve="soft",
     up_axis=(0.0, 0.0, 2.0),
     meters_per_unit=0.25,
     crop=Crop((-0.1, -0.2, -0.3), (0.1, 0.2, 0.3), (1.0, 0.0, 0.0)),
@@ -54,6 +58,7 @@ def with_matrix(matrix: str) -> str:
         ('{"white_balance": [1, 1]}', Fault("(white_balance)")),
         ('{"white_balance": [1, 0, 1]}', Fault("(white_balance[1])", "0.02 to 50", "0")),
         ('{"white_balance": [1, NaN, 1]}', Fault(expected="0.02 to 50")),
+        ('{"tone_curve": "hard"}', Fault("(tone_curve)", "soft", "hard")),
         ('{"up_axis": [0, 0, 0]}', Fault("(up_axis)", expected="a direction")),
         ('{"meters_per_unit": 0}', Fault("(meters_per_unit)", expected="1e-09 to")),
         ('{"meters_per_unit": 1e-300}', Fault("(meters_per_unit)", expected="1e-09 to")),
@@ -131,3 +136,65 @@ def test_white_balance_is_a_factor_on_light() -> None:
     torch.testing.assert_close(colored(light, WHOLE.color), light * torch.tensor([1.5, 1.0, 0.75]))
     assert colored(light, None) is light
     assert not math.isnan(float(colored(light, WHOLE.color).sum()))
+
+
+def gray(values: np.ndarray) -> np.ndarray:
+    """The soft tone curve of gray pixels with the values."""
+    pixels = torch.from_numpy(values)[:, None].expand(-1, 3)
+    mapped = with_tone_curve(pixels, "soft")
+    assert mapped.dtype == pixels.dtype
+    assert bool((mapped == mapped[:, :1]).all())
+    return mapped[:, 0].numpy()
+
+
+def test_the_tone_curve_agrees_with_a_reference_in_double_precision() -> None:
+    generator = torch.Generator().manual_seed(0)
+    linear = 10 ** (4 * torch.rand(1000, 3, generator=generator) - 3)
+    exact = linear.double().numpy()
+    largest = exact.max(axis=1, keepdims=True)
+    compressed = 1 - (1 - KNEE) ** 2 / (largest + 1 - 2 * KNEE)
+    expected = exact * np.where(largest <= KNEE, 1, compressed / largest)
+    assert 100 < int((largest <= KNEE).sum()) < 900
+    np.testing.assert_allclose(with_tone_curve(linear, "soft").numpy(), expected, rtol=1e-6)
+
+
+def test_the_tone_curve_is_smooth_at_the_knee_rises_and_approaches_white() -> None:
+    step = 1e-6
+    below, knee, above = gray(np.array([KNEE - step, KNEE, KNEE + step]))
+    assert knee == KNEE
+    assert (knee - below) / step == pytest.approx(1, abs=1e-5)
+    assert (above - knee) / step == pytest.approx(1, abs=1e-5)
+    dark = np.linspace(0, KNEE, 100)
+    assert np.array_equal(gray(dark), dark)
+    mapped = gray(np.geomspace(1e-3, 1e4, 2000))
+    assert (np.diff(mapped) > 0).all()
+    assert mapped.max() < 1
+    np.testing.assert_allclose(gray(np.array([1.0, 4.0, 1e9, math.inf])), [0.75, 0.9375, 1, 1])
+
+
+def test_the_tone_curve_keeps_the_hue() -> None:
+    linear = torch.tensor([[4.0, 1.0, 0.0], [0.25, 8.0, 2.0]], dtype=torch.float64)
+    mapped = with_tone_curve(linear, "soft")
+    torch.testing.assert_close(
+        mapped / mapped.amax(dim=1, keepdim=True), linear / linear.amax(dim=1, keepdim=True)
+    )
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_the_tone_curve_makes_no_nan(dtype: torch.dtype) -> None:
+    most = torch.finfo(dtype).max
+    values = [math.nan, math.inf, -math.inf, most, -most, -2.0, 0.0, 3.0]
+    pixels = torch.cartesian_prod(*3 * [torch.tensor(values, dtype=dtype)])
+    mapped = with_tone_curve(pixels, "soft")
+    assert bool(mapped.isfinite().all())
+    assert float(mapped.max()) == pytest.approx(1)
+    assert bool((mapped.sign() == pixels.nan_to_num(0.0).sign())[~pixels.isinf().any(dim=1)].all())
+
+
+def test_display_applies_color_and_then_the_tone_curve() -> None:
+    light = torch.tensor([[1.0, 0.5, 0.1]])
+    bright = Presentation(exposure=2.0)
+    assert torch.equal(bright.displayed(light), 4 * light)
+    curved = Presentation(exposure=2.0, tone_curve="soft")
+    assert torch.equal(curved.displayed(light), with_tone_curve(4 * light, "soft"))
+    assert with_tone_curve(light, None) is light

@@ -187,6 +187,16 @@ def test_pictures_are_balanced_and_numbers_are_not(copy: Path, tmp_path: Path) -
         return out
 
     before = rendered("before"), rendered("before_npy", "--format", "npy")
+    present(copy, "--exposure", "2")
+    bright = cv2.imread(str(rendered("bright") / "v000_final.png"))
+    present(copy, "--tone-curve", "soft")
+    soft = rendered("soft"), rendered("soft_npy", "--format", "npy")
+    curved = cv2.imread(str(soft[0] / "v000_final.png"))
+    assert (bright == 255).any()
+    assert not (curved[(bright == 255).any(axis=2)] == 255).any()
+    dark = (bright < 180).all(axis=2)
+    assert np.array_equal(curved[dark], bright[dark])
+    present(copy, "--exposure", "none", "--tone-curve", "none")
     present(copy, "--white-balance", "0.25,1,1")
     after = rendered("after"), rendered("after_npy", "--format", "npy")
     pictures = [cv2.imread(str(folder / "v000_final.png")) for folder in (before[0], after[0])]
@@ -194,6 +204,7 @@ def test_pictures_are_balanced_and_numbers_are_not(copy: Path, tmp_path: Path) -
     assert pictures[1][..., 2].mean() < 0.7 * pictures[0][..., 2].mean()
     numbers = [np.load(folder / "v000_final.npy") for folder in (before[1], after[1])]
     assert np.array_equal(*numbers)
+    assert np.array_equal(np.load(soft[1] / "v000_final.npy"), numbers[0])
 
 
 def test_an_orbit_goes_round_the_chosen_axis(copy: Path) -> None:
@@ -205,3 +216,32 @@ def test_an_orbit_goes_round_the_chosen_axis(copy: Path) -> None:
         for camera in path_cameras(trained, "orbit", 6)[0]
     ]
     np.testing.assert_allclose(heights, heights[0], atol=1e-6)
+
+
+def test_the_tone_curve_is_set_printed_and_removed(
+    copy: Path, capsys: pytest.CaptureFixture[str], refused: Callable[..., str]
+) -> None:
+    assert present(copy, "--tone-curve", "soft") == Presentation(tone_curve="soft")
+    assert "tone curve: soft" in capsys.readouterr().out
+    assert "--tone-curve: expected none or soft, found hard" in refused(
+        "present", copy, "--tone-curve", "hard"
+    )
+    assert read_presentation(copy) == Presentation(tone_curve="soft")
+    assert present(copy, "--tone-curve", "none") == Presentation()
+
+
+def test_exports_have_no_tone_curve_and_say_so(
+    copy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def exported(name: str) -> tuple[bytes, str]:
+        out = tmp_path / name
+        assert run(["export", str(copy), "--format", "ply", "--out", str(out), *ONE]) == 0
+        printed = capsys.readouterr()
+        return (out / "splats.ply").read_bytes(), printed.out + printed.err
+
+    plain, silent = exported("plain")
+    present(copy, "--tone-curve", "soft")
+    curved, said = exported("curved")
+    assert curved == plain
+    assert "tone curve" not in silent
+    assert said.count("the tone curve is not part of the exported files") == 1

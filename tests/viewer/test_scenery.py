@@ -13,7 +13,7 @@ from trainings import make_trainer
 from viewer_scenes import frame_of_scene, photograph, shown
 
 from polarguide.capture import Scene
-from polarguide.capture.presentation import Crop, Presentation
+from polarguide.capture.presentation import Crop, Presentation, with_tone_curve
 from polarguide.methods import recipe_named
 from polarguide.raster.magnification import footprints
 from polarguide.shading.result import LAYERS, POLARIZED
@@ -61,6 +61,12 @@ def test_exposure_and_reflection():
     result = seen.render(CAMERA, depth=False)
     brighter = paint(seen, Appearance(presentation=Presentation(exposure=-1.5)))
     assert np.array_equal(brighter, figures.radiance_to_rgb(result.final / 2**1.5))
+    curved = Presentation(exposure=2.0, tone_curve="soft")
+    expected = figures.radiance_to_rgb(with_tone_curve(4 * result.final, "soft"))
+    assert np.array_equal(paint(seen, Appearance(presentation=curved)), expected)
+    assert not np.array_equal(expected, figures.radiance_to_rgb(4 * result.final))
+    alpha = Appearance(layer="alpha", presentation=curved)
+    assert np.array_equal(paint(seen, alpha), paint(seen, Appearance(layer="alpha")))
     without = paint(seen, Appearance(strength=0.0))
     assert np.array_equal(without, figures.radiance_to_rgb(result.diffuse))
     doubled = paint(seen, Appearance(strength=2.0))

@@ -14,7 +14,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import msgspec
 import torch
@@ -38,11 +38,14 @@ MOST_METERS = 1e9
 WIDEST_CROP = 100.0
 STOPS = 8.0
 """Largest change of the exposure in stops, brighter or darker."""
+KNEE = 0.5
+"""Displayed linear value above which the tone curve compresses. Half of full scale keeps mid-tones unchanged."""
 
 Vector = tuple[float, float, float]
 Gain = Annotated[float, Meta(ge=0.02, le=50)]
 Factor = Annotated[float, Meta(ge=-50, le=50)]
 Text = Annotated[str, Meta(max_length=1000)]
+ToneCurve = Literal["soft"]
 
 
 class Crop(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
@@ -141,6 +144,7 @@ class Presentation(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit
         white_balance: factors by which linear R, G and B are multiplied for display, 0.02 to 50.
         chart: correction by a color chart, which is an alternative to a white balance.
         exposure: change of the displayed brightness in stops, -8 to 8.
+        tone_curve: ``soft`` compresses highlights smoothly, see ``with_tone_curve``; default: highlights are clipped.
         up_axis: up direction in the axes of the scene, a vector of any length, [3]; default: that of the cameras.
         meters_per_unit: length of the scene's unit in meters.
         crop: box that limits the displayed and exported part of the scene.
@@ -154,6 +158,7 @@ class Presentation(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit
     white_balance: tuple[Gain, Gain, Gain] | None = None
     chart: Chart | None = None
     exposure: Annotated[float, Meta(ge=-STOPS, le=STOPS)] | None = None
+    tone_curve: ToneCurve | None = None
     up_axis: Vector | None = None
     meters_per_unit: Annotated[float, Meta(ge=LEAST_METERS, le=MOST_METERS)] | None = None
     crop: Crop | None = None
@@ -197,6 +202,10 @@ class Presentation(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit
         if self.chart is not None:
             matrix = torch.tensor(self.chart.matrix)
         return matrix * 2.0 ** (self.exposure or 0.0)
+
+    def displayed(self, radiance: Tensor) -> Tensor:
+        """Convert linear radiance [..., 3] of the camera to displayed linear sRGB with the color and the tone curve."""
+        return with_tone_curve(colored(radiance, self.color), self.tone_curve)
 
     def over(self, other: Presentation) -> Presentation:
         """Return this presentation, in which missing fields are filled with the fields of another presentation.
@@ -242,6 +251,10 @@ def _check_direction(name: str, vector: Vector | None) -> None:
         )
 
 
+UNCHANGED = Presentation()
+"""Presentation with default values, which changes nothing."""
+
+
 def read_presentation(folder: Path) -> Presentation:
     """Read the presentation of a scene or a run. If the file does not exist, return an empty presentation.
 
@@ -249,7 +262,7 @@ def read_presentation(folder: Path) -> Presentation:
         PolarguideError: the file is invalid.
     """
     path = folder / PRESENTATION_FILE
-    return read_record(path, Presentation, remedy=REMEDY) if os.path.lexists(path) else Presentation()
+    return read_record(path, Presentation, remedy=REMEDY) if os.path.lexists(path) else UNCHANGED
 
 
 def write_presentation(folder: Path, presentation: Presentation) -> Path:
@@ -299,6 +312,27 @@ def colored(radiance: Tensor, color: Tensor | None) -> Tensor:
     Negative results are set to 0.
     """
     return radiance if color is None else (radiance @ color.T.to(radiance)).clamp(min=0)
+
+
+def with_tone_curve(linear: Tensor, tone_curve: ToneCurve | None) -> Tensor:
+    """Apply a tone curve to displayed linear sRGB, [..., 3] to [..., 3].
+
+    The curve ``soft`` maps the largest channel x of a pixel to ``x`` up to the knee k (``KNEE``), and above to
+    ``1 - (1 - k)^2 / (x + 1 - 2 k)``. At the knee, both parts have the value k and the slope 1, and the upper part
+    approaches 1. The other channels are multiplied by the same factor, so the hue does not change.
+
+    The curve is not linear, so it applies to complete pictures only, after blending. With a curve, NaN becomes 0.
+
+    Args:
+        linear: displayed linear sRGB of any size.
+        tone_curve: name of a curve. With None, the values are returned unchanged.
+    """
+    if tone_curve is None:
+        return linear
+    finite = linear.nan_to_num(0.0)
+    largest = finite.amax(dim=-1, keepdim=True).clamp(min=KNEE)
+    mapped = 1 - (1 - KNEE) ** 2 / (largest + 1 - 2 * KNEE)
+    return finite * (mapped / largest)
 
 
 def in_camera(radiance: Tensor, color: Tensor | None) -> Tensor:

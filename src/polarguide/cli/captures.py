@@ -124,6 +124,7 @@ def present_folder(
     white_balance: str = "",
     chart: str = "",
     exposure: str = "",
+    tone_curve: str = "",
     up_axis: str = "",
     points: tuple[str, ...] = (),
     distance: str = "",
@@ -150,6 +151,7 @@ def present_folder(
         chart: VIEW,X,Y,X,Y,X,Y,X,Y: the centers of the corner patches of a 24-patch color chart in a photograph,
             around it; or the folder of another scene with a chart. It replaces a white balance.
         exposure: Exposure compensation in stops, such as 0.5.
+        tone_curve: soft compresses highlights smoothly instead of clipping them, in pictures but not in exports.
         up_axis: An axis such as z or --up-axis=-y, three numbers, or VIEW,X,Y of a level surface. Default: the up
             axis of the cameras.
         points: Two points of known distance: X,Y,Z in the scene, VIEW,X,Y on a surface, or VIEW for a camera's
@@ -171,6 +173,7 @@ def present_folder(
         white_balance=white_balance or None,
         chart=chart or None,
         exposure=exposure or None,
+        tone_curve=tone_curve or None,
         up_axis=up_axis or None,
         points=points,
         distance=distance or None,

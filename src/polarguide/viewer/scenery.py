@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from polarguide.capture import Scene, View
-from polarguide.capture.presentation import Crop, Presentation, colored
+from polarguide.capture.presentation import UNCHANGED, Crop, Presentation
 from polarguide.gaussians.gaussians import Gaussians
 from polarguide.geometry.camera import Camera, quaternion
 from polarguide.geometry.camera_path import camera_record, interpolated
@@ -32,7 +32,6 @@ from polarguide.shading.result import POLARIZED, RenderResult, polarized_layers
 from polarguide.training.loop import TrainingLoop
 from polarguide.visualization import figures
 from polarguide.visualization.figures import (
-    RADIANCE,
     Picture,
     depth_range,
     layer_picture,
@@ -399,10 +398,6 @@ LEGEND = 0.25, 128, 512
 """Width of the legend: share of the picture's width, minimum in pixels, maximum in pixels."""
 
 
-UNCHANGED = Presentation()
-"""Presentation with default values, which changes nothing."""
-
-
 @dataclass(frozen=True)
 class Appearance:
     """Settings of a picture that a visitor chooses.
@@ -413,7 +408,7 @@ class Appearance:
         turn: rotation of the far environment in degrees, counter-clockwise seen from above.
         wipe: share of the picture's width, from the left, that shows the other run. Without another run, this part
             shows the measured layer (``BESIDE``) at the pose of a photograph.
-        presentation: color, exposure, up axis and crop box. Without a crop box, the whole scene is shown.
+        presentation: color, exposure, tone curve, up axis and crop box. Without a crop box, the whole scene is shown.
     """
 
     layer: str = "final"
@@ -536,11 +531,9 @@ class Painter:
         values = result.layers.get(layer)
         if values is None:
             return None
-        if layer in RADIANCE:
-            return figures.radiance_to_rgb(colored(values, appearance.presentation.color))
         if layer == "depth" and (settled or self._depths is None):
             self._depths = depth_range(values, result.alpha > 0.5)
-        return layer_picture(result, layer, camera, self._depths)
+        return layer_picture(result, layer, camera, self._depths, presentation=appearance.presentation)
 
     def _measured(
         self, scenery: Scenery, view: View | None, appearance: Appearance, frame_size: tuple[int, int]
@@ -550,7 +543,7 @@ class Painter:
         if view is None or (layer in OF_POLARIZATION and not view.is_determined):
             return None
         if layer == "photograph":
-            picture = figures.radiance_to_rgb(colored(view.photograph(), appearance.presentation.color))
+            picture = figures.radiance_to_rgb(appearance.presentation.displayed(view.photograph()))
         elif layer == "error":
             brighter = 2.0 ** (appearance.presentation.exposure or 0.0)
             final = self._result(scenery, view.camera, appearance).final

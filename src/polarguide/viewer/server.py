@@ -22,6 +22,7 @@ import msgspec
 from polarguide.capture import Scene
 from polarguide.capture.presentation import (
     PRESENTATION_FILE,
+    UNCHANGED,
     Presentation,
     read_presentation,
     write_presentation,
@@ -38,7 +39,6 @@ from polarguide.shading.model import ShadingModel, radiance_cubemap
 from polarguide.training.loop import TrainingLoop
 from polarguide.viewer.guard import Accepts, Gate, checked_message, guarded
 from polarguide.viewer.scenery import (
-    UNCHANGED,
     Photograph,
     Scenery,
     photographs,

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
-from polarguide.capture.presentation import PRESENTATION_FILE, STOPS, Crop, Presentation
+from polarguide.capture.presentation import PRESENTATION_FILE, STOPS, UNCHANGED, Crop, Presentation
 from polarguide.core.records import to_json
 from polarguide.geometry.camera import Camera
 from polarguide.geometry.scene_frame import SceneFrame
@@ -20,7 +20,6 @@ from polarguide.viewer.guard import Accepts, choice, flag, number, pair, push
 from polarguide.viewer.scenery import (
     MEASURED,
     MOST_KEYFRAMES,
-    UNCHANGED,
     Appearance,
     Frusta,
     Painter,

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from polarguide import optics
 from polarguide.capture import View
-from polarguide.capture.presentation import colored
+from polarguide.capture.presentation import UNCHANGED, Presentation, colored, with_tone_curve
 from polarguide.core.files import write_whole
 from polarguide.geometry.camera import Camera
 from polarguide.optics.color import shown
@@ -411,7 +411,7 @@ def layer_picture(
     depths: Depths | None = None,
     *,
     exposed: bool = False,
-    color: Tensor | None = None,
+    presentation: Presentation = UNCHANGED,
 ) -> Picture | None:
     """Return a layer as an 8-bit picture, or None if the recipe lacks it.
 
@@ -420,7 +420,7 @@ def layer_picture(
         name: name of the layer.
         depths: depths at the ends of the color scale of the layer depth.
         exposed: darken radiance so that at most 1 % of the pixels clip.
-        color: color matrix of the presentation, [3, 3], for layers of radiance.
+        presentation: color and tone curve of layers of radiance.
     """
     if name in POLARIZED:
         return polarization_picture(name, result.layers["stokes"]) if "stokes" in result.layers else None
@@ -428,15 +428,16 @@ def layer_picture(
     if values is None:
         return None
     if name in RADIANCE:
-        values = colored(values, color)
-    if exposed:
-        values = values * clipping_exposure(values)
+        values = colored(values, presentation.color)
+        if exposed:
+            values = values * clipping_exposure(values)
+        return radiance_to_rgb(with_tone_curve(values, presentation.tone_curve))
     if name == "depth":
         there = result.alpha > 0.5
         return depth_picture(torch.where(there, values, 0.0), depths or depth_range(values, there))
     if name == "normal":
         return normal_to_rgb(values, camera)
-    return scalar_to_rgb(values, 0.0, 1.0) if name in _SHARES else radiance_to_rgb(values)
+    return scalar_to_rgb(values, 0.0, 1.0)
 
 
 def polarization_picture(name: str, stokes: Tensor) -> Picture:
@@ -519,7 +520,7 @@ def true_name(name: str) -> str:
 
 
 def reference_pictures(
-    view: View, color: Tensor | None = None, depths: Depths | None = None
+    view: View, presentation: Presentation = UNCHANGED, depths: Depths | None = None
 ) -> dict[str, Picture]:
     """Return reference pictures of a view's layers, 8-bit.
 
@@ -527,10 +528,11 @@ def reference_pictures(
     measured polarization as ``NAME, measured``.
 
     Args:
-        color, depths: see ``layer_picture``.
+        presentation, depths: see ``layer_picture``.
     """
     pictures = {
-        true_name(name): picture for name, picture in ground_truth_pictures(view, color, depths).items()
+        true_name(name): picture
+        for name, picture in ground_truth_pictures(view, presentation, depths).items()
     }
     if view.is_determined:
         stokes = view.stokes()
@@ -539,13 +541,13 @@ def reference_pictures(
 
 
 def ground_truth_pictures(
-    view: View, color: Tensor | None = None, depths: Depths | None = None
+    view: View, presentation: Presentation = UNCHANGED, depths: Depths | None = None
 ) -> dict[str, Picture]:
     """Return the photograph as ``final`` and the ground truth of other layers as 8-bit pictures.
 
     The result contains depth only if ``depths`` is specified.
     """
-    pictures = {"final": radiance_to_rgb(colored(view.photograph(), color))}
+    pictures = {"final": radiance_to_rgb(presentation.displayed(view.photograph()))}
     ground_truth = view.ground_truth
     if ground_truth is None:
         return pictures
@@ -553,7 +555,7 @@ def ground_truth_pictures(
         pictures["normal"] = normal_to_rgb(ground_truth.normal, view.camera)
     for name, layer in (("specular", ground_truth.specular), ("diffuse", ground_truth.diffuse)):
         if layer is not None:
-            pictures[name] = radiance_to_rgb(colored(layer / 2, color))
+            pictures[name] = radiance_to_rgb(presentation.displayed(layer / 2))
     if ground_truth.depth is not None and depths is not None:
         pictures["depth"] = depth_picture(ground_truth.depth, depths)
     return pictures

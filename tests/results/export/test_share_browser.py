@@ -351,6 +351,31 @@ def test_the_screen_shows_what_pictures_gives(fresh: Opened) -> None:
     assert psnr(shot, ours("polarguide-stokes", "final", seen)) > LEAST
 
 
+def test_a_page_with_a_tone_curve_shows_highlights_as_our_pictures_do(browser: Any, tmp_path: Path) -> None:
+    state, shading = random_state("polarguide-stokes")
+    presentation = Presentation(chart=CHART, exposure=2.0, tone_curve="soft")
+    path = tmp_path / "page.html"
+    page = share_page(
+        state.gaussians, state.light, shading, ring(), first="v0", title="t", presentation=presentation
+    )
+    write_text(path, page)
+    opened = Opened(browser, path)
+    camera = ring()["v0"]
+    layers = ["final", "diffuse", "specular", "normal"]
+    with torch.no_grad():
+        result = drawn(state, shading, camera, None)
+    shown = dict(zip(layers, opened.pictures("v0", layers), strict=True))
+    for layer in layers:
+        expected = layer_picture(result, layer, camera, presentation=presentation)
+        assert psnr(shown[layer], expected) > LEAST, layer
+    clipped = layer_picture(result, "final", camera, presentation=Presentation(chart=CHART, exposure=2.0))
+    assert psnr(shown["final"], clipped) < 25
+    opened.page.evaluate("delete polarguide.scene.toneCurve")
+    assert psnr(opened.pictures("v0", ["final"])[0], clipped) > LEAST
+    assert not opened.complaints
+    opened.page.close()
+
+
 def test_a_presented_page_shows_white_scale_and_credit_and_turns_about_its_axis(
     browser: Any, tmp_path: Path
 ) -> None:
@@ -380,13 +405,13 @@ def test_a_presented_page_shows_white_scale_and_credit_and_turns_about_its_axis(
     camera = ring()["v0"]
     with torch.no_grad():
         result = drawn(state, shading, camera, trained_at_half_size(state))
-    expected = layer_picture(result, "final", camera, color=presentation.color)
+    expected = layer_picture(result, "final", camera, presentation=presentation)
     assert psnr(opened.pictures("v0", ["final"])[0], expected) > LEAST
     plain = ours("polarguide-stokes", "normal", camera)
     assert psnr(opened.pictures("v0", ["normal"])[0], plain) > LEAST
     opened.page.keyboard.press("w")
     unbalanced = opened.pictures("v0", ["final"])[0]
-    exposed = layer_picture(result, "final", camera, color=Presentation(exposure=-0.5).color)
+    exposed = layer_picture(result, "final", camera, presentation=Presentation(exposure=-0.5))
     assert psnr(unbalanced, exposed) > LEAST
     assert not opened.page.is_checked("#white")
     opened.page.click("#white")

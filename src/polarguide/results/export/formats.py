@@ -415,7 +415,7 @@ def export(
             of the scene, except in GLB and USD files.
         model: options of the textured model.
         normals: options of the normal maps.
-        reporter: receives the progress.
+        reporter: receives the progress, and a line if the presentation has a tone curve, which no file contains.
 
     Returns:
         The written files and folders.
@@ -446,6 +446,8 @@ def export(
     # The number of Gaussians matters only for formats with Gaussians.
     listener = SILENT if format in ("environment", "cameras", "normals") else reporter
     presented = Presented(run, axes=axes, masked=model.masked, reporter=listener)
+    if presented.presentation.tone_curve is not None and format != "stl":
+        reporter.say("the tone curve is not part of the exported files")
     make_folder(folder)
     with reporter.track(f"writing {format}", None):
         return _WRITERS[format](

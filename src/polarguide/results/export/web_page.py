@@ -18,7 +18,7 @@ from torch.nn.functional import normalize, pad
 
 from polarguide import __version__
 from polarguide.capture import View
-from polarguide.capture.presentation import STOPS, Presentation
+from polarguide.capture.presentation import STOPS, UNCHANGED, Presentation
 from polarguide.core.errors import PolarguideError
 from polarguide.core.files import make_folder, write_text
 from polarguide.core.options import PathLike
@@ -210,7 +210,6 @@ SCRIPTS = (
     "unpack.js",
     "main.js",
 )
-NOTHING = Presentation()
 SHADERS = {
     "records": "records.glsl",
     "derive": "derive.frag",
@@ -262,7 +261,7 @@ def share_page(
     caption: str = "",
     metrics: Sequence[tuple[str, str]] = (),
     notes: Sequence[str] = (),
-    presentation: Presentation = NOTHING,
+    presentation: Presentation = UNCHANGED,
     footprints: Tensor | None = None,
     gloss: float = 1.0,
 ) -> str:
@@ -277,7 +276,7 @@ def share_page(
         title, caption: any text; the page escapes it.
         metrics: labels and values, any text.
         notes: paragraphs before the metrics, any text.
-        presentation: color, up axis, scale and credit.
+        presentation: color, tone curve, up axis, scale and credit.
         footprints: [N] size of a training pixel at each Gaussian, see ``raster.magnification``, or None if unknown.
         gloss: factor on the brightness of the specular layer when the page shows it alone.
 
@@ -353,6 +352,7 @@ def _frame(cameras: Mapping[str, Camera], first: str, presentation: Presentation
     return {
         "color": None if color is None else color.flatten().tolist(),
         "exposure": presentation.exposure or 0.0,
+        "toneCurve": presentation.tone_curve,
         "metersPerUnit": presentation.meters_per_unit,
         "up": around.up.tolist(),
         "center": around.center.tolist(),

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from polarguide.capture import Scene, View
 from polarguide.capture.layout import refuse_scene, require_memory
+from polarguide.capture.presentation import Presentation
 from polarguide.core.errors import PolarguideError, optional_import
 from polarguide.core.files import atomic, make_folder, require_inside, write_whole
 from polarguide.core.options import PathLike, PictureFormat, check_choice, check_finite
@@ -124,7 +125,7 @@ def write_pictures(
     make_folder(folder)
     rows: list[tuple[str, dict[str, Picture]]] = []
     missing: set[str] = set()
-    color = run.presentation.color
+    presentation = run.presentation
     polarization = run.polarization
     about = {"Polarization": polarization}
     depths = common_depths(run, chosen) if "depth" in names else None
@@ -132,20 +133,20 @@ def write_pictures(
     with reporter.track("rendering", len(chosen)) as advance:
         for number, view in enumerate(chosen):
             result = run.result(view.camera, polarized=polarized).to("cpu")
-            pictures = _layer_pictures(result, names, view, depths, color)
+            pictures = _layer_pictures(result, names, view, depths, presentation)
             missing |= {*names} - pictures.keys()
             for name, picture in pictures.items():
                 path = folder / f"{view.name}_{name}.{format}"
                 if format != "png":
                     _write_numbers(path, result.layers[name])
                 elif transparent:
-                    colors = _layer_pictures(_unblended(result), [name], view, depths, color)[name]
+                    colors = _layer_pictures(_unblended(result), [name], view, depths, presentation)[name]
                     alpha = (result.alpha.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
                     figures.write_png(path, colors, alpha, about)
                 else:
                     figures.write_png(path, picture, about=about)
             if len(rows) < SHEET_VIEWS:
-                rows.append((view.name, pictures | reference_pictures(view, color, depths)))
+                rows.append((view.name, pictures | reference_pictures(view, presentation, depths)))
             advance(number + 1)
     if format != "png":
         write_whole(
@@ -159,11 +160,17 @@ def write_pictures(
 
 
 def _layer_pictures(
-    result: RenderResult, names: Sequence[str], view: View, depths: Depths | None, color: Tensor | None
+    result: RenderResult,
+    names: Sequence[str],
+    view: View,
+    depths: Depths | None,
+    presentation: Presentation,
 ) -> dict[str, Picture]:
     """Return pictures of the named layers; layers that the rendering lacks are omitted."""
     pictures = {
-        name: layer_picture(result, name, view.camera, depths, exposed=name == "reflection", color=color)
+        name: layer_picture(
+            result, name, view.camera, depths, exposed=name == "reflection", presentation=presentation
+        )
         for name in names
     }
     return {name: picture for name, picture in pictures.items() if picture is not None}
@@ -433,7 +440,7 @@ def _pictures(
     """Yield one picture per camera, which shows the layers side by side; ``named`` adds their names."""
     within = part_shown(run, reporter)
     depths = rendered_depths(run, cameras, within) if "depth" in layers else None
-    color = run.presentation.color
+    presentation = run.presentation
     surface = bool({"normal", "depth"} & {*layers})
     polarized = not {*layers}.isdisjoint(POLARIZED)
     with reporter.track("rendering", len(cameras)) as advance:
@@ -444,7 +451,7 @@ def _pictures(
             run.chosen_layers(result, layers)
             tiles = []
             for name in layers:
-                picture = layer_picture(result, name, camera, depths, color=color)
+                picture = layer_picture(result, name, camera, depths, presentation=presentation)
                 assert picture is not None
                 tiles.append(figures.with_name(picture, name) if named else picture)
             advance(number + 1)

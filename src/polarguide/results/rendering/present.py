@@ -16,7 +16,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import cv2
 import msgspec
@@ -34,6 +34,7 @@ from polarguide.capture.presentation import (
     PRESENTATION_FILE,
     Chart,
     Presentation,
+    ToneCurve,
     Vector,
     parse_length,
     read_presentation,
@@ -318,6 +319,7 @@ def present(
     white_balance: str | None = None,
     chart: str | None = None,
     exposure: str | None = None,
+    tone_curve: str | None = None,
     up_axis: str | None = None,
     points: Sequence[str] = (),
     distance: str | None = None,
@@ -343,6 +345,7 @@ def present(
         chart: ``none``, or VIEW,X,Y,X,Y,X,Y,X,Y: the centers of the corner patches of a 24-patch color chart, around
             it; or the folder of another scene or run with a chart. It replaces a white balance.
         exposure: exposure compensation in stops, -8 to 8, or ``none``.
+        tone_curve: ``soft``, which compresses highlights, or ``none``, which clips them.
         up_axis: ``none`` (the up axis of the cameras), an axis such as ``z`` or ``-y``, three numbers, or VIEW,X,Y: a
             place on a level surface, whose normal is up.
         points: two PLACEs of known distance.
@@ -370,6 +373,7 @@ def present(
         "white_balance": (_white_balance, white_balance),
         "chart": (_chart, chart),
         "exposure": (_exposure, exposure),
+        "tone_curve": (_tone_curve, tone_curve),
         "up_axis": (_up_axis, up_axis),
     }
     for name, (parse, text) in parsers.items():
@@ -534,6 +538,12 @@ def _exposure(text: str, place: _PresentedFolder) -> float:
     return _require_numbers(text, 1, "exposure", "stops such as 0.5, or none")[0]
 
 
+def _tone_curve(text: str, _: _PresentedFolder) -> str:
+    if text not in get_args(ToneCurve):
+        raise _wrong("tone_curve", f"none or {', '.join(get_args(ToneCurve))}", text)
+    return text
+
+
 def _up_axis(text: str, place: _PresentedFolder) -> Vector | None:
     if (axis := AXES.get(text.removeprefix("-").removeprefix("+").lower())) is not None:
         sign = -1.0 if text.startswith("-") else 1.0
@@ -606,6 +616,7 @@ def presentation_lines(presentation: Presentation) -> list[str]:
         "color chart": chart
         and f"{chart.patches} patches in {chart.view}, CIEDE2000 {chart.delta_e:.1f}, up to {chart.delta_e_worst:.1f}",
         "exposure": f"{exposure:+g} stops" if exposure else "",
+        "tone curve": presentation.tone_curve,
         "up axis": _listed(presentation.up_axis),
         "scale": "" if scale is None else f"1 unit is {shown_length(1.0, scale)}",
         "crop": sides and f"{_listed(sides)} % of the cameras' distance",

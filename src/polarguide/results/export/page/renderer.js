@@ -181,6 +181,7 @@ class Renderer {
       layer: ["1i", layer], split: ["1f", split], gain: ["1f", gain], exposure: ["1f", exposure], color: ["mat3", color],
       index: ["1f", this.scene.index], resolution: ["1i", this.scene.resolution], levels: ["1i", this.scene.levels],
       mirror: ["1f", this.scene.mirror || 0], gloss: ["1f", this.scene.gloss],
+      soft: ["1i", this.scene.toneCurve === "soft" ? 1 : 0],
     });
     gl.bindVertexArray(this.nothing);
     gl.drawArrays(gl.TRIANGLES, 0, 3);

@@ -10,13 +10,25 @@ uniform float gain;    // on the specular layer
 uniform float gloss;   // on it where it is shown alone
 uniform float exposure;
 uniform mat3 color;    // from the camera's linear RGB to what is shown
+uniform bool soft;     // compress highlights
 uniform float index;   // refractive
 out vec4 shown;
 
 const float MAXIMUM_LOG = 5.0;
 
+// The tone curve of capture/presentation.py.
+const float KNEE = 0.5;
+vec3 toneMapped(vec3 linear) {
+  vec3 v = min(linear, 1e30); // infinity times 0 is not a number
+  float largest = max(max(max(v.r, v.g), v.b), KNEE);
+  float mapped = 1.0 - (1.0 - KNEE) * (1.0 - KNEE) / (largest + 1.0 - 2.0 * KNEE);
+  return v * (mapped / largest);
+}
+
 vec3 encode(vec3 linear) {
-  vec3 v = clamp(color * linear * exposure, 0.0, 1.0);
+  vec3 v = color * linear * exposure;
+  if (soft) v = toneMapped(v);
+  v = clamp(v, 0.0, 1.0);
   return mix(12.92 * v, 1.055 * pow(max(v, 0.0031308), vec3(1.0 / 2.4)) - 0.055, greaterThan(v, vec3(0.0031308)));
 }
 
