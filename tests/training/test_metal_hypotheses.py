@@ -215,7 +215,7 @@ def test_the_light_of_a_scene_is_the_distribution_of_all_its_pixels() -> None:
 def test_a_metal_in_front_of_dark_light_costs_the_square_of_its_distance() -> None:
     mean, spread = math.log(0.2), 0.6
     light = SceneLight(mean, spread, dark=0.0)
-    reflectance = torch.tensor([[0.5, 0.5, 0.5], [0.9, 0.5, 0.1], [0.5, 0.5, 0.5]]).double()
+    reflectance = torch.tensor([[0.5, 0.5, 0.5], [0.9, 0.5, 0.1], [0.5, 0.5, 0.5]], dtype=torch.float64)
     mirrored = torch.tensor([-2.0, -1.0, 3.0]).double()  # standard deviations
     s0 = 0.5 * torch.exp(mean + spread * mirrored)[:, None].expand(-1, 3)
     changes = torch.exp(torch.tensor([-0.3, 0.0, 0.3]).double())
