@@ -9,7 +9,7 @@ SCENES/bench is the folder scenes of polarguide bench --render-only.
 The runs of a scene are in OUT/PART/SCENE, and its record is benchmarks/results/final/PART/SCENE.json. The record is
 written after the scene, and after Ctrl-C. The same command resumes. It repeats no recipe whose seeds are all in the
 record, also on another machine without OUT. To add seeds, change the number in the part and repeat the command. A
-record of other code is refused. The tables are printed by
+record of other code or settings is refused. The tables are printed by
 
     python benchmarks/accuracy/bench_tables.py benchmarks/results/final/PART/*.json
 
@@ -33,13 +33,12 @@ from polarguide.cli.console import ConsoleReporter
 from polarguide.core.errors import PolarguideError, require
 from polarguide.core.files import make_folder, write_text
 from polarguide.core.records import read_record
-from polarguide.results.evaluation.evaluate import code_digest
+from polarguide.results.evaluation.evaluate import code_digest, commit
 from polarguide.training.settings import TrainSettings
 from polarguide_bench.join import join_records
 from polarguide_bench.options import CompareOptions
 from polarguide_bench.recipes import recipe_named
-from polarguide_bench.results import Record, Results, read_results
-from polarguide_bench.verbs import print_results
+from polarguide_bench.results import Record, read_results
 
 HERE = Path(__file__).resolve().parent
 RECORDS = HERE.parent / "results" / "final"
@@ -102,24 +101,40 @@ def check_scenes(parts: Iterable[Part], scenes: Path) -> None:
     )
 
 
-def read_finished(path: Path) -> Record | None:
-    """Return the finished runs of a record, or None if there are none.
+def read_finished(path: Path, part: Part, threads: int) -> Record | None:
+    """Return the finished runs of a part's recipes in a record, or None if there are none.
 
     Raises:
-        PolarguideError: the record is invalid, or other code wrote it.
+        PolarguideError: the record is invalid, or it was written by other code or with other settings.
     """
     if not path.exists():
         return None
     record = read_results(path)
+    provenance = record.provenance
     require(
-        record.provenance.sources == code_digest(),
+        provenance.sources == code_digest()
+        or (provenance.commit is not None and provenance.commit == commit()),
         path,
         expected=f"a record of this code, whose digest is {code_digest()}",
-        found=f"the digest {record.provenance.sources} of commit {record.provenance.commit}",
-        remedy="Check out that commit, or remove the records to measure again.",
+        found=f"the digest {provenance.sources} of commit {provenance.commit}",
+        remedy="Check out that commit, or remove the records and OUT to measure again.",
     )
-    runs = [run for run in record.runs if run.state == "done"]
-    return msgspec.structs.replace(record, runs=runs) if runs else None
+    for name, value in (
+        ("steps", part.steps),
+        ("downscale", part.downscale),
+        ("refractive_index", part.refractive_index),
+        ("threads", threads),
+    ):
+        require(
+            getattr(record.settings, name) == value,
+            f"{path} (settings.{name})",
+            expected=str(value),
+            found=str(getattr(record.settings, name)),
+            remedy="Measure with the settings of the record, or remove the record.",
+        )
+    runs = [run for run in record.runs if run.state == "done" and run.recipe in part.recipes]
+    recipes = [recipe for recipe in record.recipes if recipe.name in part.recipes]
+    return msgspec.structs.replace(record, runs=runs, recipes=recipes) if runs else None
 
 
 def missing_recipes(part: Part, scene: str, finished: Record | None) -> dict[str, int]:
@@ -130,13 +145,15 @@ def missing_recipes(part: Part, scene: str, finished: Record | None) -> dict[str
 
 
 def joined(finished: Record | None, measured: Record, part: Part) -> Record:
-    """Return the runs of a new record, and the finished runs of the other recipes, in the order of the part."""
-    records = {"the measurement": measured}
-    recipes = {run.recipe for run in measured.runs}
-    kept = [] if finished is None else [run for run in finished.runs if run.recipe not in recipes]
+    """Return the runs of a new record, and earlier finished runs that it does not have, in the order of the part."""
+    done = {(run.recipe, run.seed) for run in measured.runs if run.state == "done"}
+    earlier = [] if finished is None else finished.runs
+    kept = {(run.recipe, run.seed): run for run in earlier if (run.recipe, run.seed) not in done}
+    runs = [run for run in measured.runs if (run.recipe, run.seed) not in kept]
+    records = {"the measurement": msgspec.structs.replace(measured, runs=runs)}
     if finished is not None and kept:
-        records["the earlier record"] = msgspec.structs.replace(finished, runs=kept)
-    known = {run.recipe for record in records.values() for run in record.runs}
+        records["the earlier record"] = msgspec.structs.replace(finished, runs=list(kept.values()))
+    known = {recipe.name for record in records.values() for recipe in record.recipes}
     record = join_records(records, against=part.against if part.against in known else None)
     order = list(part.recipes)
     return msgspec.structs.replace(
@@ -146,7 +163,7 @@ def joined(finished: Record | None, measured: Record, part: Part) -> Record:
     )
 
 
-def measure(part: Part, scene: Path, out: Path, path: Path, *, jobs: int, threads: int) -> Results:
+def measure(part: Part, scene: Path, out: Path, path: Path, *, jobs: int, threads: int) -> Record:
     """Train and score the runs of a part on a scene that are not in its record, and write the record.
 
     Args:
@@ -160,10 +177,12 @@ def measure(part: Part, scene: Path, out: Path, path: Path, *, jobs: int, thread
     Raises:
         PolarguideError: the comparison fails, or other code wrote the record.
     """
-    finished = read_finished(path)
+    finished = read_finished(path, part, threads)
     missing = missing_recipes(part, scene.name, finished)
     if finished is not None and not missing:
-        return Results(finished)
+        return finished
+    written = out / "results.json"
+    written.unlink(missing_ok=True)  # of an earlier call, perhaps of other code
     try:
         polarguide.compare(
             [scene],
@@ -183,10 +202,10 @@ def measure(part: Part, scene: Path, out: Path, path: Path, *, jobs: int, thread
             reporter=ConsoleReporter(),
         )
     finally:
-        if (out / "results.json").exists():
-            record = joined(finished, read_results(out / "results.json"), part)
+        if written.exists():
+            record = joined(finished, read_results(written), part)
             write_text(path, json.dumps(msgspec.to_builtins(record), indent=1, allow_nan=False) + "\n")
-    return Results(record)
+    return record
 
 
 def main() -> None:
@@ -206,26 +225,30 @@ def main() -> None:
             for name in options.parts
         }
         check_scenes(parts.values(), options.scenes)
-        results = {}
-        for name, part in parts.items():
-            print(f"{name}: {part.about}", flush=True)
-            make_folder(options.records / name)
-            for scene in part.scenes:
-                out = options.out / name / scene
-                results[out] = measure(
-                    part,
-                    options.scenes / part.folder / scene,
-                    out,
-                    options.records / name / f"{scene}.json",
-                    jobs=options.jobs,
-                    threads=options.threads,
-                )
-        for out, scene_results in results.items():
-            print_results(scene_results, out)
+        records = {
+            options.records / name / f"{scene}.json": (name, part, scene)
+            for name, part in parts.items()
+            for scene in part.scenes
+        }
+        for path, (_, part, _) in records.items():
+            read_finished(path, part, options.threads)
+        failed = []
+        for path, (name, part, scene) in records.items():
+            print(f"{name}: {part.about}: {scene}", flush=True)
+            make_folder(path.parent)
+            folder = options.scenes / part.folder / scene
+            out = options.out / name / scene
+            record = measure(part, folder, out, path, jobs=options.jobs, threads=options.threads)
+            failed += [
+                f"{path}, {run.recipe}, seed {run.seed}: {run.error}" for run in record.runs if run.error
+            ]
+        print(f"records: {options.records}")
     except PolarguideError as error:
         parser.error(str(error))
     except KeyboardInterrupt:
         sys.exit("Stopped. The same command resumes.")
+    if failed:
+        sys.exit("These runs have failed. Remove the cause and repeat the command.\n" + "\n".join(failed))
 
 
 if __name__ == "__main__":

@@ -171,7 +171,7 @@ def trained(monkeypatch: pytest.MonkeyPatch) -> list[str]:
             "recipes": [RecipeRecord(name, "", {}) for name in names],
             "runs": runs,
         }
-        out.mkdir()
+        out.mkdir(exist_ok=True)
         (out / "results.json").write_bytes(msgspec.json.encode(record))
 
     monkeypatch.setattr(polarguide, "compare", compare)
@@ -183,7 +183,7 @@ def test_a_recorded_recipe_is_not_trained_again(trained: list[str], tmp_path: Pa
 
     def finished(out: str, recipes: dict[str, int]) -> list[tuple[str, int]]:
         part = measure.Part("", ["s"], 2, recipes, against="polgs")
-        record = measure.measure(part, tmp_path / "s", tmp_path / out, path, jobs=2, threads=1).record
+        record = measure.measure(part, tmp_path / "s", tmp_path / out, path, jobs=2, threads=1)
         assert record == read_results(path)
         assert record.settings.against == ("polgs" if "polgs" in recipes else None)
         return [(run.recipe, run.seed) for run in record.runs if run.state == "done"]
@@ -195,6 +195,49 @@ def test_a_recorded_recipe_is_not_trained_again(trained: list[str], tmp_path: Pa
     assert finished("3", more) == [("polgs", 0), ("3dgs", 0), ("3dgs", 1), ("3dgs-dr", 0)]
     assert finished("4", more) == [("polgs", 0), ("3dgs", 0), ("3dgs", 1), ("3dgs-dr", 0)]
     assert trained == ["3dgs", "3dgs-dr", "3dgs-dr", "polgs", "3dgs"]
-    path.write_text(path.read_text().replace(code_digest(), "0" * 16))
-    with pytest.raises(PolarguideError, match="digest 0000000000000000"):
-        finished("5", more)
+    one = measure.read_finished(path, measure.Part("", ["s"], 2, {"polgs": 1}), threads=1)
+    assert one is not None
+    assert ([run.recipe for run in one.runs], [recipe.name for recipe in one.recipes]) == (
+        ["polgs"],
+        ["polgs"],
+    )
+    text = path.read_text()
+    for old, new, fault in (
+        (code_digest(), "0" * 16, "digest 0000000000000000"),
+        ('"steps": 2', '"steps": 3', "settings.steps"),
+    ):
+        path.write_text(text.replace(old, new))
+        with pytest.raises(PolarguideError, match=fault):
+            finished("6", more)
+
+
+def test_finished_seeds_stay_in_the_record(trained: list[str], tmp_path: Path) -> None:
+    """``3dgs-dr`` is missing in the first comparison that trains it."""
+    path = tmp_path / "record.json"
+
+    def states(out: str, recipes: dict[str, int]) -> list[tuple[str, int, str]]:
+        part = measure.Part("", ["s"], 2, recipes)
+        record = measure.measure(part, tmp_path / "s", tmp_path / out, path, jobs=2, threads=1)
+        return [(run.recipe, run.seed, run.state) for run in record.runs]
+
+    states("1", {"3dgs-dr": 1})
+    assert states("2", {"3dgs-dr": 1}) == [("3dgs-dr", 0, "done")]
+    trained.clear()
+    assert states("3", {"3dgs-dr": 2}) == [("3dgs-dr", 0, "done"), ("3dgs-dr", 1, "missing")]
+
+
+def test_an_earlier_comparison_is_not_a_record(
+    trained: list[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    part = measure.Part("", ["s"], 2, {"3dgs": 1})
+    path = tmp_path / "record.json"
+    measure.measure(part, tmp_path / "s", tmp_path / "out", path, jobs=2, threads=1)
+    path.unlink()
+
+    def stopped(*_: Any, **__: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(polarguide, "compare", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        measure.measure(part, tmp_path / "s", tmp_path / "out", path, jobs=2, threads=1)
+    assert not path.exists()

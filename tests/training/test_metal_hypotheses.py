@@ -1,6 +1,7 @@
 """Likelihoods of metals and dielectrics against slow references in float64, and their prior of error variances."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -24,7 +25,8 @@ from polarguide.training.metals.hypotheses import (
     scene_light,
     variance_prior,
 )
-from polarguide.training.metals.observations import ViewSamples, samples_of, view_sums
+from polarguide.training.metals.observations import ViewSamples, samples_of, valid_radiance, view_sums
+from polarguide.training.metals.search import MetalEvidence, neighbors_of, of_views
 from polarguide.training.recipe import MetalRules, MetalViews
 
 RULES, LIMITS = MetalRules(), MetalViews()
@@ -229,3 +231,29 @@ def test_a_metal_in_front_of_dark_light_costs_the_square_of_its_distance() -> No
         normal=torch.zeros(views, 3, 3).double(),
     )
     assert light.cost(samples, reflectance).tolist() == pytest.approx([2.0, 0.5, 0.0], abs=1e-9)
+
+
+def test_radiance_is_that_of_valid_pixels() -> None:
+    view = views_of("gold")[0]
+    invalid = torch.zeros(view.camera.height, view.camera.width, dtype=torch.bool)
+    invalid[:5] = True
+    view = replace(view, invalid=invalid)
+    valid = ~(invalid | view.saturated)
+    torch.testing.assert_close(valid_radiance(view), view.stokes()[0][valid], atol=1e-4, rtol=0)
+
+
+def test_dark_light_reduces_evidence_by_at_most_that_of_one_gaussian() -> None:
+    ball = gaussians_of_the_ball()
+    looks = [view_sums(ball, view, rasterize_cpu, LIMITS.least_normal) for view in views_of("gold")]
+    labels = torch.zeros(len(ball["means"]))
+    neighbors = neighbors_of(ball)
+
+    def measured(mean: float) -> MetalEvidence:
+        return of_views(looks, SceneLight(mean, 1.0, LIMITS.dark), labels, neighbors, 1.5, RULES, LIMITS)
+
+    bright, gray, dark = (measured(mean) for mean in (-20.0, 0.0, 20.0))
+    seen = bright.views > 0.5
+    lost = [((bright.ratio - other.ratio) * bright.views)[seen] for other in (gray, dark)]
+    assert float(lost[0].max()) > 0
+    assert float(lost[0].max()) <= RULES.trust + 1e-3
+    torch.testing.assert_close(lost[1], torch.full_like(lost[1], RULES.trust), atol=1e-3, rtol=0)

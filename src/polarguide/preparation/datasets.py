@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Literal
 
 DatasetName = Literal["pandora", "pisr", "nersp", "neisf", "gnerp", "phygap"]
-READERS = "polarguide_bench.datasets.sources"
+READER_MODULE = "polarguide_bench.datasets.sources"
 """Module of the readers. Its function ``dataset_source`` opens a dataset."""
 LAYOUTS = {
     "nersp": ("s0/", "s1/", "s2/"),

@@ -42,7 +42,7 @@ from polarguide.core.errors import PolarguideError, PolarguideWarning, import_pa
 from polarguide.core.files import require_folder
 from polarguide.core.progress import Reporter
 from polarguide.core.text import command, stem_of
-from polarguide.preparation.datasets import READERS, detect_dataset
+from polarguide.preparation.datasets import READER_MODULE, detect_dataset
 from polarguide.preparation.filter_source import FilterSource, ShotsSource, SinglesSource
 from polarguide.preparation.mosaic_source import MosaicSource
 from polarguide.preparation.settings import (
@@ -361,7 +361,7 @@ def _source(
         case MosaicSettings() as mosaics if kind == "mosaic":
             return MosaicSource(root, mosaics)
         case others:
-            source: Source = import_part(READERS, f"{root} (dataset {kind})").dataset_source(
+            source: Source = import_part(READER_MODULE, f"{root} (dataset {kind})").dataset_source(
                 root, kind, others
             )
             return source

@@ -230,6 +230,7 @@ ROOT = Path(__file__).resolve().parents[3]
         ("results/a.py", "second = 2", (True, False)),
         ("viewer/a.py", "second = 2", (False, False)),
         ("../polarguide_bench/polgs.py", "second = 2", (True, True)),
+        ("../polarguide_bench/worker.py", "second = 2", (True, False)),
         ("../polarguide_bench/tables.py", "second = 2", (False, False)),
         ("_native.so", "second", (True, True)),
         ("new.py", "", (True, True)),

@@ -77,7 +77,9 @@ NOT_TRAINING = ("results", *NOT_SCORING)
 BENCH = "polarguide_bench"
 """Neighboring package with the recipes of comparisons."""
 BENCH_METHODS = ("recipes.py", "polgs.py", "gnerp", "datasets")
-"""Parts of the bench that prepare, train and score. The other parts plan runs and write tables."""
+"""Parts of the bench that prepare and train."""
+BENCH_TABLES = ("join.py", "tables.py", "figures.py", "report.py", "verbs.py")
+"""Parts of the bench that only write tables and reports of finished scores."""
 
 
 @lru_cache
@@ -94,9 +96,12 @@ def code_digest(package: Path = PACKAGE, *, training: bool = False) -> str:
     left_out = NOT_TRAINING if training else NOT_SCORING
     sources = [path for path in package.rglob("*.py") if path.relative_to(package).parts[0] not in left_out]
     bench = package.with_name(BENCH)
-    methods = [path for path in bench.rglob("*.py") if path.relative_to(bench).parts[0] in BENCH_METHODS]
+    for path in bench.rglob("*.py"):
+        part = path.relative_to(bench).parts[0]
+        if part in BENCH_METHODS if training else part not in BENCH_TABLES:
+            sources.append(path)
     compiled = [path for path in package.glob("_native.*") if path.suffix != ".pyi"]
-    return _digest(package.parent, [*sources, *methods, *compiled])
+    return _digest(package.parent, [*sources, *compiled])
 
 
 def _digest(folder: Path, files: Sequence[Path]) -> str:

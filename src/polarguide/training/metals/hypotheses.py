@@ -62,7 +62,7 @@ UNKNOWNS = 2
 """Number of unknowns of each hypothesis. As many views are needed to determine the unknowns, and give no evidence."""
 NOISE = 1e-4
 """Mean square of the noise of a camera relative to the light. Smaller errors count as this error in the prior."""
-LEAST_SPREAD = 1e-3
+LEAST_VARIANCE = 1e-3
 """Least variance of logarithms: of error variances and of radiance. For error variances, it limits the weight of the
 prior to 2,000 observations."""
 
@@ -119,7 +119,7 @@ def scene_light(pictures: Iterable[Tensor], dark: float) -> SceneLight:
         logarithms = log_radiance(s0, dark).double().cpu()
         moments += torch.stack([logarithms**power for power in range(3)]).sum(dim=1)
     mean, square = (float(moment / moments[0].clamp(min=1)) for moment in moments[1:])
-    return SceneLight(mean, math.sqrt(max(square - mean * mean, LEAST_SPREAD)), dark)
+    return SceneLight(mean, math.sqrt(max(square - mean * mean, LEAST_VARIANCE)), dark)
 
 
 class MetalFit(NamedTuple):
@@ -317,8 +317,8 @@ def variance_prior(errors: Tensor, observations: Tensor) -> VariancePrior:
     half = 0.5 * observations.double().cpu().numpy()
     logarithms = errors.double().clamp(min=NOISE).cpu().numpy()
     logarithms = np.log(logarithms) - digamma(half) + np.log(half)
-    spread = max(float(logarithms.var() - polygamma(1, half).mean()), LEAST_SPREAD)
-    weight = 2 * brentq(lambda value: polygamma(1, value) - spread, 1e-6, 1e6)
+    variance = max(float(logarithms.var() - polygamma(1, half).mean()), LEAST_VARIANCE)
+    weight = 2 * brentq(lambda value: polygamma(1, value) - variance, 1e-6, 1e6)
     scale = math.exp(float(logarithms.mean()) + digamma(weight / 2) - math.log(weight / 2))
     return VariancePrior(scale, weight)
 

@@ -5,12 +5,8 @@ E(x) has two sums. One is the sum of ``-u x`` over all Gaussians. The other is t
 over all pairs of neighbors. The evidence u is the evidence of the views minus the prior, in nats. It is infinite for
 Gaussians that the user labels. Each connected piece of metal has an additional fixed cost.
 
-The evidence of the views is the log likelihood ratio of metal and dielectric for each Gaussian. At a Gaussian, a view
-measures S0 and two components of polarization for each color. P is the polarization across the plane of incidence of
-the rendered normal, and U is the polarization at 45 degrees to this plane. ``rho`` are Fresnel's degrees of
-polarization.
-
-``training.metals.hypotheses`` computes this ratio.
+The evidence of the views is the log likelihood ratio of metal and dielectric for each Gaussian
+(``training.metals.hypotheses``). A metal in front of light that is darker than the pictures loses evidence.
 """
 
 from __future__ import annotations
@@ -143,7 +139,9 @@ def of_views(
     )
     views = (count - UNKNOWNS).clamp(min=0)
     nats = log_ratio(metal, DielectricTerms(*columns), views, neighbors)
-    ratio = nats / views.clamp(min=1e-6) - _tint_cost(color, total, rules) - dark
+    # The room behind the camera may be darker than the pictures, so brightness alone does not outweigh all else.
+    nats -= (views * dark).clamp(max=rules.trust)
+    ratio = nats / views.clamp(min=1e-6) - _tint_cost(color, total, rules)
     return MetalEvidence(ratio, views, reflectance, color.clamp(min=0), labels)
 
 
