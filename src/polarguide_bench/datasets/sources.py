@@ -10,7 +10,6 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from polarguide.capture.angle_evidence import OutlineAgreement, outline_agreement, sense_of_outlines
 from polarguide.capture.calibration import Sense, oriented
 from polarguide.capture.colmap.poses import Geometry
 from polarguide.capture.formats.stored import stated_size
@@ -24,6 +23,7 @@ from polarguide.preparation.mosaic_source import MosaicMeasured, MosaicSource
 from polarguide.preparation.settings import MosaicSettings
 from polarguide.preparation.source import DevelopedView, Factor, Measured, Source, Stored, ViewRecord
 from polarguide_bench.datasets.dataset import Dataset, not_as_published, resized_mask
+from polarguide_bench.datasets.outlines import OutlineAgreement, outline_agreement, sense_of_outlines
 from polarguide_bench.datasets.readers import open_dataset
 
 PAIR_SUMS = (

@@ -23,7 +23,6 @@ from dataset_files import (
 )
 from faults import Fault
 
-from polarguide.capture.angle_evidence import OutlineAgreement, outline_agreement, sense_of_outlines
 from polarguide.capture.calibration import Calibration
 from polarguide.capture.formats.pictures import read_mask
 from polarguide.core.errors import PolarguideWarning
@@ -31,6 +30,7 @@ from polarguide.preparation.datasets import LAYOUTS, detect_dataset
 from polarguide.preparation.prepare import prepare_scene
 from polarguide.preparation.settings import PrepareSettings
 from polarguide_bench.datasets.dataset import Dataset
+from polarguide_bench.datasets.outlines import OutlineAgreement, outline_agreement, sense_of_outlines
 from polarguide_bench.datasets.readers import READERS, open_dataset
 from polarguide_bench.datasets.sources import StokesSource
 
