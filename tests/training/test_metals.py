@@ -392,16 +392,17 @@ def test_only_the_last_look_decides_hard(tiny_scene: Scene, monkeypatch: pytest.
     assert priors == [SOFT_PRIORS] * (len(steps) - 1) + [(1.0,)]
 
 
-def test_what_the_prior_alone_decides_is_undecided(
-    tiny_scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("evidence", [0.9, 0.0, -0.6])
+def test_weak_evidence_for_either_material_is_undecided(
+    evidence: float, tiny_scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A half of the Gaussians has evidence, but less than the prior; it is said, and drawn, until the user decides."""
+    """Half of the Gaussians has evidence below the prior's margin. It is reported and drawn until the user labels it."""
     recipe, heard = RECIPE, Heard()
     trainer = make_trainer(tiny_scene, recipe, 1500)
     gaussians = trainer.state.gaussians
     first = gaussians["means"][:, 0] > gaussians["means"][:, 0].median()
     values = {
-        "ratio": torch.where(first, 0.9, -2.0) * RULES.prior,
+        "ratio": torch.where(first, evidence, -2.0) * RULES.prior,
         "color": torch.where(first, 0.9, 0.02)[:, None].expand(-1, 3),
     }
     monkeypatch.setattr("polarguide.training.metals.search.evidence", lambda *_: said(len(first), **values))

@@ -736,7 +736,7 @@ def report_metals(
         ". Label metal in materials/ of the scene (docs/how-to/train.md), and train again" if unknown else ""
     )
     reporter.say(
-        f"metals: {metal:.1f} % of the pixels; not decided by polarization: {unknown:.1f} %, see "
+        f"metals: {metal:.1f} % of the pixels; undecided, because both materials fit: {unknown:.1f} %, see "
         f"{out / METALS_PICTURE}{advice}"
     )
 

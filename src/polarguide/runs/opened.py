@@ -314,12 +314,12 @@ class OpenedRun:
 
     @cached_property
     def _possible_metals(self) -> Tensor | None:
-        """Mask [N] of the Gaussians that are dielectrics only because of the prior, see ``MetalSearch.undecided``."""
+        """Mask [N] of dielectric Gaussians that may be metals, see ``MetalSearch.undecided``."""
         context = TrainingContext(self.scene, self.recipe, self.configuration.settings, self.model.backend)
         return MetalSearch(context).undecided(self.model.state)
 
     def undecided(self, camera: Camera) -> Tensor | None:
-        """Render the share [H, W] of surfaces that are dielectrics only because of the prior of metals.
+        """Render the share [H, W] of dielectric surfaces that may be metals.
 
         The first call measures all training views, so the scene is read. The result is None if the training did not
         search for metals, or if no view determines the Stokes vector.

@@ -396,17 +396,17 @@ class MetalSearch:
 
     @torch.no_grad()
     def undecided(self, state: TrainingState) -> Tensor | None:
-        """Return a mask [N] of Gaussians that are dielectrics only because of the prior.
+        """Return a mask [N] of dielectric Gaussians that the opposite prior would make metals.
 
-        Their measurements alone would make them metals. Return None if the training does not search for metals, or if
-        no view determines the Stokes vector.
+        The prior requires that a metal is likelier by a margin. A certain dielectric is likelier by the same margin.
+        Return None if the training does not search for metals, or if no view determines the Stokes vector.
         """
         if not self._looks or not any(view.is_determined for view in self._context.views):
             return None
         gaussians = state.gaussians
         rules = self._context.recipe.metal_rules
-        without = decide(self._measure(state), gaussians, self._allowed(state), rules, (0.0,))
-        return (without > 0) & (gaussians["metalness"] == 0)
+        opposite = decide(self._measure(state), gaussians, self._allowed(state), rules, (-1.0,))
+        return (opposite > 0) & (gaussians["metalness"] == 0)
 
     def _measure(self, state: TrainingState) -> MetalEvidence:
         context = self._context
