@@ -148,24 +148,41 @@ def draw_angles(scenes: Scenes) -> None:
     save(figure, "angles")
 
 
-METALS = {"metals-a": ("jug", "jug_handle", "pot"), "kit": ("lid_blue", "ruler"), "car": ("chrome",)}
+METALS = {
+    "metals-a": {"jug": ("jug", "jug_handle"), "pot": ("pot",)},
+    "kit": {"lid": ("lid_blue",), "ruler": ("ruler",)},
+    "frame": {"frame": ("frame",)},
+    "metals-b": {"gold cup": ("cup",), "iron kettle": ("kettle",)},
+    "alloys": {
+        "polished alloys": (
+            "gold_ball",
+            "copper_cup",
+            "brass_candlestick",
+            "steel_can",
+            "chrome_ring",
+            "aluminum_egg",
+        ),
+        "rough alloys": ("rough_gold_bell", "rough_copper_stone", "rough_steel_ball", "rough_aluminum_block"),
+    },
+}
+"""Metals by scene. Objects with one label are drawn as their mean."""
 
 
 def draw_constants(scenes: Mapping[str, Mapping[str, Mapping[str, float]]]) -> None:
     """Draw the recall of each metal, and the dielectric with most false metal pixels, over the constants of metals."""
     settings = list(next(iter(scenes.values())))
     figure, axes = pyplot.subplots(figsize=(7, 2.8), layout="constrained")
-    for scene, names in METALS.items():
-        for name in names:
-            shares = [scenes[scene][setting][name] for setting in settings]
-            axes.plot(settings, shares, "o", markersize=5, label=name.replace("_", " "), alpha=0.8)
+    dielectrics = {}
+    for scene, labels in METALS.items():
+        for label, names in labels.items():
+            shares = [
+                statistics.fmean(scenes[scene][setting][name] for name in names) for setting in settings
+            ]
+            axes.plot(settings, shares, "o", markersize=5, label=label, alpha=0.8)
+        metals = {name for names in labels.values() for name in names}
+        dielectrics[scene] = scenes[scene]["as is"].keys() - metals
     wrong = [
-        max(
-            share
-            for scene, at in scenes.items()
-            for name, share in at[setting].items()
-            if name not in METALS.get(scene, ())
-        )
+        max(scenes[scene][setting][name] for scene, names in dielectrics.items() for name in names)
         for setting in settings
     ]
     axes.plot(settings, wrong, "x", color=COLORS[0], label="most of a dielectric")

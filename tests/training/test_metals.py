@@ -396,7 +396,7 @@ def test_only_the_last_look_decides_hard(tiny_scene: Scene, monkeypatch: pytest.
 def test_weak_evidence_for_either_material_is_undecided(
     evidence: float, tiny_scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Half of the Gaussians has evidence below the prior's margin. It is reported and drawn until the user labels it."""
+    """Half of the Gaussians has less evidence than the prior. It is reported and drawn until the user labels it."""
     recipe, heard = RECIPE, Heard()
     trainer = make_trainer(tiny_scene, recipe, 1500)
     gaussians = trainer.state.gaussians

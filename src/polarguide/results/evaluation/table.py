@@ -270,7 +270,7 @@ COLUMNS = [metric for metric in METRICS if metric.shown != "record"]
 METAL_SHARE = Metric("metal_share", "taken for metal", "%", 1, None, factor=100.0)
 """Share of the pixels of an object with a metalness above one half, for recipes with metals."""
 UNDECIDED_SHARE = Metric("undecided_share", "undecided metal", "%", 1, None, factor=100.0)
-"""Share of the pixels of an object that are dielectrics only because of the prior, for trainings that search metals."""
+"""Share of the pixels of an object that are dielectrics and may be metals, for trainings that search for metals."""
 PART_SHARES = {METAL_SHARE: "metalness", UNDECIDED_SHARE: "undecided"}
 """Layer of each share. A pixel counts if the value of the layer is above one half."""
 PART_METRICS = (*(metric for metric in COLUMNS if metric.of == "view"), *PART_SHARES)

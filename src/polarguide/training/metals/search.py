@@ -367,7 +367,7 @@ class MetalSearch:
         if not self._warned:
             self._warn_of_contradictions(gaussians, measured.labels)
         priors = self._priors(state.step)
-        metal = decide(measured, gaussians, self._allowed(state), context.recipe.metal_rules, priors)
+        metal = decide(measured, gaussians, self.allowed(state), context.recipe.metal_rules, priors)
         reflectance = measured.reflectance
         determined = [view for view in views if view.is_determined]
         gain = partial(
@@ -405,7 +405,7 @@ class MetalSearch:
             return None
         gaussians = state.gaussians
         rules = self._context.recipe.metal_rules
-        opposite = decide(self._measure(state), gaussians, self._allowed(state), rules, (-1.0,))
+        opposite = decide(self._measure(state), gaussians, self.allowed(state), rules, (-1.0,))
         return (opposite > 0) & (gaussians["metalness"] == 0)
 
     def _measure(self, state: TrainingState) -> MetalEvidence:
@@ -420,7 +420,7 @@ class MetalSearch:
             context.memory,
         )
 
-    def _allowed(self, state: TrainingState) -> Tensor:
+    def allowed(self, state: TrainingState) -> Tensor:
         """Return a mask [N] of Gaussians that may be metals without a label.
 
         Without polarization, no Gaussian is allowed, because the extent of a labeled surface is then unknown.
