@@ -1,6 +1,6 @@
 """Train and score all methods on all scenes of the final measurement, part by part.
 
-    python benchmarks/final/measure.py SCENES OUT [--parts four bench ...] [--jobs 1] [--threads 1]
+    python benchmarks/final/measure.py SCENES OUT [--parts four bench ...] [--only SCENE ...] [--recipes RECIPE ...]
 
 Each JSON file in this folder is a part: scenes, recipes with their numbers of seeds, and settings. SCENES contains the
 scene folders, in a subfolder if the part names one. SCENES/heldout is the output of benchmarks/heldout/render.py, and
@@ -23,7 +23,7 @@ import json
 import shlex
 import sys
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 
 import msgspec
@@ -32,6 +32,7 @@ import polarguide
 from polarguide.cli.console import ConsoleReporter
 from polarguide.core.errors import PolarguideError, require
 from polarguide.core.files import make_folder, write_text
+from polarguide.core.options import check_choice
 from polarguide.core.records import read_record
 from polarguide.results.evaluation.evaluate import code_digest, commit
 from polarguide.training.settings import TrainSettings
@@ -137,11 +138,35 @@ def read_finished(path: Path, part: Part, threads: int) -> Record | None:
     return msgspec.structs.replace(record, runs=runs, recipes=recipes) if runs else None
 
 
-def missing_recipes(part: Part, scene: str, finished: Record | None) -> dict[str, int]:
-    """Return the recipes of a part with fewer finished runs on a scene than seeds, and their numbers of seeds."""
+def selected(parts: Mapping[str, Part], scenes: Collection[str], recipes: Collection[str]) -> dict[str, Part]:
+    """Return the parts that have at least one of the scenes and of the recipes, with these scenes only.
+
+    An empty collection selects everything.
+
+    Raises:
+        PolarguideError: no part has one of the scenes or one of the recipes.
+    """
+    for scene in scenes:
+        check_choice("--only", scene, sorted({scene for part in parts.values() for scene in part.scenes}))
+    for recipe in recipes:
+        check_choice("--recipes", recipe, sorted({name for part in parts.values() for name in part.recipes}))
+    chosen = {}
+    for name, part in parts.items():
+        named = [scene for scene in part.scenes if not scenes or scene in scenes]
+        if named and (not recipes or part.recipes.keys() & set(recipes)):
+            chosen[name] = msgspec.structs.replace(part, scenes=named)
+    return chosen
+
+
+def missing_recipes(part: Part, scene: str, finished: Record | None, only: Collection[str]) -> dict[str, int]:
+    """Return the recipes of a part with fewer finished runs on a scene than seeds, and their numbers of seeds.
+
+    If ``only`` names recipes, all other recipes are left out.
+    """
     runs = [] if finished is None else finished.runs
     done = Counter(run.recipe for run in runs if run.scene == scene)
-    return {recipe: seeds for recipe, seeds in part.recipes.items() if done[recipe] < seeds}
+    wanted = {recipe: seeds for recipe, seeds in part.recipes.items() if not only or recipe in only}
+    return {recipe: seeds for recipe, seeds in wanted.items() if done[recipe] < seeds}
 
 
 def joined(finished: Record | None, measured: Record, part: Part) -> Record:
@@ -163,7 +188,16 @@ def joined(finished: Record | None, measured: Record, part: Part) -> Record:
     )
 
 
-def measure(part: Part, scene: Path, out: Path, path: Path, *, jobs: int, threads: int) -> Record:
+def measure(
+    part: Part,
+    scene: Path,
+    out: Path,
+    path: Path,
+    *,
+    only: Collection[str] = (),
+    jobs: int = 1,
+    threads: int = 1,
+) -> Record:
     """Train and score the runs of a part on a scene that are not in its record, and write the record.
 
     Args:
@@ -171,6 +205,7 @@ def measure(part: Part, scene: Path, out: Path, path: Path, *, jobs: int, thread
         scene: scene folder.
         out: folder for the runs.
         path: record of the scene.
+        only: recipes to train now; empty for all recipes of the part.
         jobs: number of simultaneous runs.
         threads: threads of each run.
 
@@ -178,7 +213,7 @@ def measure(part: Part, scene: Path, out: Path, path: Path, *, jobs: int, thread
         PolarguideError: the comparison fails, or other code wrote the record.
     """
     finished = read_finished(path, part, threads)
-    missing = missing_recipes(part, scene.name, finished)
+    missing = missing_recipes(part, scene.name, finished, only)
     if finished is not None and not missing:
         return finished
     written = out / "results.json"
@@ -215,6 +250,10 @@ def main() -> None:
     parser.add_argument("scenes", type=Path)
     parser.add_argument("out", type=Path)
     parser.add_argument("--parts", nargs="+", default=PARTS, help="names of parts, or JSON files")
+    parser.add_argument("--only", nargs="+", default=(), metavar="SCENE", help="names of scenes")
+    parser.add_argument(
+        "--recipes", nargs="+", default=(), help="recipes to train now; a later call adds others"
+    )
     parser.add_argument("--records", type=Path, default=RECORDS)
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--threads", type=int, default=1)
@@ -224,6 +263,7 @@ def main() -> None:
             Path(name).stem: read_part(HERE / f"{name}.json" if name in PARTS else Path(name))
             for name in options.parts
         }
+        parts = selected(parts, options.only, options.recipes)
         check_scenes(parts.values(), options.scenes)
         records = {
             options.records / name / f"{scene}.json": (name, part, scene)
@@ -238,7 +278,9 @@ def main() -> None:
             make_folder(path.parent)
             folder = options.scenes / part.folder / scene
             out = options.out / name / scene
-            record = measure(part, folder, out, path, jobs=options.jobs, threads=options.threads)
+            record = measure(
+                part, folder, out, path, only=options.recipes, jobs=options.jobs, threads=options.threads
+            )
             failed += [
                 f"{path}, {run.recipe}, seed {run.seed}: {run.error}" for run in record.runs if run.error
             ]

@@ -226,6 +226,35 @@ def test_finished_seeds_stay_in_the_record(trained: list[str], tmp_path: Path) -
     assert states("3", {"3dgs-dr": 2}) == [("3dgs-dr", 0, "done"), ("3dgs-dr", 1, "missing")]
 
 
+def test_some_recipes_are_trained_first(trained: list[str], tmp_path: Path) -> None:
+    path = tmp_path / "record.json"
+    part = measure.Part("", ["s"], 2, {"3dgs": 1, "polgs": 2})
+
+    def seeds(*only: str) -> list[tuple[str, int]]:
+        record = measure.measure(part, tmp_path / "s", tmp_path / "out", path, only=only)
+        return [(run.recipe, run.seed) for run in record.runs]
+
+    assert seeds("polgs") == [("polgs", 0), ("polgs", 1)]
+    assert seeds("polgs") == [("polgs", 0), ("polgs", 1)]
+    assert seeds() == [("3dgs", 0), ("polgs", 0), ("polgs", 1)]
+    assert trained == ["polgs", "3dgs"]
+
+
+def test_scenes_and_recipes_select_parts() -> None:
+    parts = {
+        "a": measure.Part("", ["cup", "car"], 2, {"3dgs": 1}),
+        "b": measure.Part("", ["car"], 2, {"polgs": 1}),
+    }
+    assert measure.selected(parts, [], []) == parts
+    assert measure.selected(parts, ["cup"], []) == {"a": measure.Part("", ["cup"], 2, {"3dgs": 1})}
+    assert measure.selected(parts, [], ["polgs"]) == {"b": parts["b"]}
+    assert measure.selected(parts, ["cup"], ["polgs"]) == {}
+    with pytest.raises(PolarguideError, match="cap"):
+        measure.selected(parts, ["cap"], [])
+    with pytest.raises(PolarguideError, match="3dgss"):
+        measure.selected(parts, [], ["3dgss"])
+
+
 def test_an_earlier_comparison_is_not_a_record(
     trained: list[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
