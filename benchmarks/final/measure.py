@@ -43,7 +43,7 @@ from polarguide_bench.results import Record, read_results
 
 HERE = Path(__file__).resolve().parent
 RECORDS = HERE.parent / "results" / "final"
-PARTS = ("heldout", "four", "bench", "real", "publication", "ablations")
+PARTS = ("heldout", "four", "bench", "metals", "real", "publication", "ablations")
 """Parts in the order of the measurement."""
 
 
