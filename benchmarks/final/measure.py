@@ -13,7 +13,8 @@ record of other code or settings is refused. The tables are printed by
 
     python benchmarks/accuracy/bench_tables.py benchmarks/results/final/PART/*.json
 
-Times and speeds are measured only with --jobs 1 on a machine without other work.
+Times and speeds are measured only with --jobs 1 on a machine without other work. On a busy machine, --no-speed saves
+the time of measurements that would be refused.
 """
 
 from __future__ import annotations
@@ -195,6 +196,7 @@ def measure(
     path: Path,
     *,
     only: Collection[str] = (),
+    speed: bool = False,
     jobs: int = 1,
     threads: int = 1,
 ) -> Record:
@@ -206,6 +208,7 @@ def measure(
         out: folder for the runs.
         path: record of the scene.
         only: recipes to train now; empty for all recipes of the part.
+        speed: measure frames per second after all trainings.
         jobs: number of simultaneous runs.
         threads: threads of each run.
 
@@ -228,7 +231,7 @@ def measure(
                 jobs=jobs,
                 threads=threads,
                 seeds=max(missing.values()),
-                speed=jobs == 1,
+                speed=speed,
                 downscale=part.downscale,
             ),
             seeds_of=missing,
@@ -255,6 +258,7 @@ def main() -> None:
         "--recipes", nargs="+", default=(), help="recipes to train now; a later call adds others"
     )
     parser.add_argument("--records", type=Path, default=RECORDS)
+    parser.add_argument("--no-speed", action="store_true", help="leave out frames per second")
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--threads", type=int, default=1)
     options = parser.parse_args()
@@ -279,7 +283,14 @@ def main() -> None:
             folder = options.scenes / part.folder / scene
             out = options.out / name / scene
             record = measure(
-                part, folder, out, path, only=options.recipes, jobs=options.jobs, threads=options.threads
+                part,
+                folder,
+                out,
+                path,
+                only=options.recipes,
+                speed=options.jobs == 1 and not options.no_speed,
+                jobs=options.jobs,
+                threads=options.threads,
             )
             failed += [
                 f"{path}, {run.recipe}, seed {run.seed}: {run.error}" for run in record.runs if run.error
