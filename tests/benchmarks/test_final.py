@@ -47,14 +47,10 @@ def test_parts_contain_all_scenes() -> None:
     bench, heldout = (measure.read_part(measure.HERE / f"{name}.json") for name in ("bench", "heldout"))
     assert set(bench.scenes) == {*BENCH.development, *BENCH.held_back}
     assert (bench.steps, bench.refractive_index) == (BENCH.training.steps, BENCH.training.refractive_index)
-    assert tuple(heldout.scenes) == render.SCENES == tuple(path.stem for path in scene_files())
-
-
-def scene_files() -> list[Path]:
-    """Scene files in the order of ``render.SCENES``. Unlisted files are last."""
-    order = {name: number for number, name in enumerate(render.SCENES)}
-    files = [path for path in render.HERE.glob("*.json") if path != render.CHECKSUMS]
-    return sorted(files, key=lambda path: order.get(path.stem, len(order)))
+    assert tuple(heldout.scenes) == render.SCENES
+    files = {path.stem for path in render.HERE.glob("*.json") if path != render.CHECKSUMS}
+    assert files == {*render.SCENES, *render.USED}
+    assert not {*render.SCENES} & {*render.USED}
 
 
 @pytest.mark.parametrize(
@@ -84,13 +80,13 @@ def test_all_scenes_are_checked_before_the_first_training(tmp_path: Path) -> Non
         measure.check_scenes(parts, tmp_path)
 
 
-@pytest.mark.parametrize("name", render.SCENES)
+@pytest.mark.parametrize("name", render.SCENES + render.USED)
 def test_a_held_back_scene_has_its_views(name: str) -> None:
     scene = find_scene(str(render.HERE / f"{name}.json"))
     assert scene.name == name
     assert (scene.camera.views, len(range(0, scene.camera.views, render.SYNTH.test_every))) == (48, 8)
     metals = {thing.name for thing in scene.things if thing.material.type == "metal"}
-    assert bool(metals) == (name in ("valve", "trophy"))
+    assert bool(metals) == (name in ("workbench", "sideboard", *render.USED))
     assert scene.object_only == (name == "tortoise")
 
 

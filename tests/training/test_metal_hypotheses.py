@@ -22,10 +22,17 @@ from polarguide.training.metals.hypotheses import (
     dielectric_fit,
     dielectric_terms,
     log_ratio,
+    metal_fit,
     scene_light,
     variance_prior,
 )
-from polarguide.training.metals.observations import ViewSamples, samples_of, valid_radiance, view_sums
+from polarguide.training.metals.observations import (
+    ViewSamples,
+    samples_of,
+    stokes_noise,
+    valid_radiance,
+    view_sums,
+)
 from polarguide.training.metals.search import MetalEvidence, neighbors_of, of_views
 from polarguide.training.recipe import MetalRules, MetalViews
 
@@ -55,6 +62,7 @@ def turning_samples(seed: int) -> ViewSamples:
         s0=diffuse + specular,
         across=over * specular - under * diffuse + noise,
         oblique=torch.zeros(VIEWS, SURFACES, 3).double(),
+        noise=torch.zeros(VIEWS, SURFACES, 3).double(),
         cosine=cosine,
         normal=normal,
     )
@@ -196,6 +204,39 @@ def test_each_gaussian_gets_the_normals_of_its_pixels() -> None:
     assert float(cosines.min()) > 0.95
 
 
+def test_polarization_by_noise_is_no_evidence() -> None:
+    """A metal explains all oblique polarization. If this is noise, the errors are those without it."""
+    clean = turning_samples(0)
+    generator = torch.Generator().manual_seed(1)
+    noise = 0.05 * torch.randn(VIEWS, SURFACES, 3, generator=generator).double()
+    noisy = clean._replace(oblique=noise, noise=noise)
+    unknown = noisy._replace(noise=torch.zeros_like(noise))
+    expected, measured, wrong = (metal_fit(samples, SETTING).error for samples in (clean, noisy, unknown))
+    torch.testing.assert_close(measured, expected)
+    assert bool((wrong < expected).all())
+    errors = (dielectric_terms(samples, SETTING).error() for samples in (clean, noisy))
+    torch.testing.assert_close(*errors)
+    mirrored = clean._replace(oblique=noise + 0.2, noise=noise)
+    assert bool((metal_fit(mirrored, SETTING).error < expected).all())
+
+
+def test_four_angles_determine_the_noise_of_the_stokes_vector() -> None:
+    view = views_of("gray", 0.0)[0]
+    clean = stokes_noise(view)
+    assert float(clean.abs().max()) < 1e-4
+    generator = torch.Generator().manual_seed(2)
+    codes = view.codes.to(torch.int32) // 2 + 8000
+    changes = torch.randint(-400, 401, codes.shape, generator=generator, dtype=torch.int32)
+    first, second = (
+        replace(view, pictures=(codes + change).to(view.codes.dtype))
+        for change in (torch.zeros_like(changes), changes)
+    )
+    difference = second.stokes()[1] - first.stokes()[1]
+    assert float(stokes_noise(second).std()) == pytest.approx(float(difference.std()), rel=0.05)
+    single = replace(view, pictures=view.codes[:1], exposures=view.exposures[:1])
+    assert not bool(stokes_noise(single).any())
+
+
 def test_surfaces_in_too_few_views_give_no_evidence() -> None:
     views = torch.tensor([0.0, 0.3, 0.0])
     assert not bool(ratio_of(torch.ones(3), 0.1 * torch.ones(3), views).any())
@@ -227,6 +268,7 @@ def test_a_metal_in_front_of_dark_light_costs_the_square_of_its_distance() -> No
         s0=changes[:, None, None] * s0,
         across=torch.zeros(views, 3, 3).double(),
         oblique=torch.zeros(views, 3, 3).double(),
+        noise=torch.zeros(views, 3, 3).double(),
         cosine=torch.full((views, 3), 0.7).double(),
         normal=torch.zeros(views, 3, 3).double(),
     )

@@ -66,6 +66,7 @@ def samples_with(**given: Tensor) -> ViewSamples:
         "weight": torch.ones(s0.shape[:2]).to(s0),
         "across": torch.zeros_like(s0),
         "oblique": torch.zeros_like(s0),
+        "noise": torch.zeros_like(s0),
         "normal": torch.tensor([0.0, 0.0, 1.0]).to(s0).expand_as(s0),
     }
     return ViewSamples(**{**plain, **given})

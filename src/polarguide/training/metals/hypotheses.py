@@ -13,7 +13,9 @@ degrees of polarization.
 Unpolarized light has no U. Polarized light changes P about as much as U. A metal preserves at most the share
 ``conductor_oblique_share`` of U (aluminum 0.98 at 45 degrees and 0.91 at 60; copper and gold 0.57 at 60 and 0.1 at 70).
 A dielectric preserves at most ``sqrt(Rs Rp)`` times the light of the scene. Under each hypothesis, the explained part
-of U reduces the error in P, and the rest of U is added as an error.
+of U reduces the error in P, and the rest of U is added as an error. Noise also causes U. It explains nothing and is no
+error, so both parts lose the variance of the noise, which four angles determine (``ViewSamples.noise``). Without this,
+the U of textured or noisy pictures would be evidence for metals, which explain more of U than dielectrics.
 
 **Brightness.** A metal mirrors light of the scene, so that observed color over reflectance has the brightness of the
 scene. The logarithm of its brightness is normal, with the mean and the variance of all pixels of the pictures. A metal
@@ -185,9 +187,11 @@ class _Weights:
 
 
 def _explained(samples: ViewSamples, largest: Tensor, weights: _Weights) -> tuple[Tensor, Tensor]:
-    """Return the part [N] of U, up to ``largest``, that a hypothesis explains, and the rest [N]."""
+    """Return the part [N] of U, up to ``largest``, that a hypothesis explains, and the rest [N], both beyond noise."""
+    noise = weights.mean(samples.noise**2)
     beyond = weights.mean((samples.oblique.abs() - largest).clamp(min=0) ** 2)
-    return (weights.mean(samples.oblique**2) - beyond).clamp(min=0), beyond
+    within = weights.mean(samples.oblique**2) - beyond
+    return (within - noise).clamp(min=0), (beyond - noise).clamp(min=0)
 
 
 def metal_fit(samples: ViewSamples, setting: Setting) -> MetalFit:

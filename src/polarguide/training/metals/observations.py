@@ -5,6 +5,7 @@ A pixel contributes to the values of a Gaussian in proportion to the blending we
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
@@ -14,6 +15,7 @@ from torch import Tensor
 from polarguide import optics
 from polarguide._native import MAX_CHANNELS
 from polarguide.capture import View
+from polarguide.capture.exposures import FOUR
 from polarguide.core.system import UNBOUNDED, MemoryBound
 from polarguide.gaussians.gaussians import any_nonzero
 from polarguide.geometry.camera import Camera
@@ -36,6 +38,8 @@ class ViewSamples(NamedTuple):
         s0: [V, N, 3] mean S0.
         across: [V, N, 3] mean polarization P across the plane of incidence.
         oblique: [V, N, 3] mean polarization at 45 degrees to that plane.
+        noise: [V, N, 3] mean of ``(I0 + I90 - I45 - I135) / sqrt(2)``, which is zero without noise. With independent
+            noise on the four intensities, its variance is that of S1 and S2. It is 0 in views without these angles.
         cosine: [V, N] mean cosine of the zenith angle.
         normal: [V, N, 3] mean rendered normal, in world axes.
     """
@@ -44,6 +48,7 @@ class ViewSamples(NamedTuple):
     s0: Tensor
     across: Tensor
     oblique: Tensor
+    noise: Tensor
     cosine: Tensor
     normal: Tensor
 
@@ -68,11 +73,19 @@ def shares(gaussians: Parameters, camera: Camera, target: Tensor, rasterize: Ras
         return torch.autograd.grad(total, features)[0]
 
 
+def stokes_noise(view: View) -> Tensor:
+    """Return a sample [H, W, 3] of the noise of S1 and S2 in each pixel, as ``ViewSamples.noise`` describes."""
+    if view.exposures != FOUR:
+        return torch.zeros_like(view.photograph())
+    i0, i45, i90, i135 = view.intensities()
+    return (i0 + i90 - i45 - i135) / math.sqrt(2)
+
+
 def view_sums(gaussians: Parameters, view: View, rasterize: Rasterize, least_normal: float) -> Tensor:
-    """Return sums [N, 14] over the pixels of each Gaussian in a view, which has to determine the Stokes vector.
+    """Return sums [N, 17] over the pixels of each Gaussian in a view, which has to determine the Stokes vector.
 
     ``samples_of`` converts these sums to means. The columns are 1, S0 (three colors), P (three), the polarization at 45
-    degrees (three), the cosine of the zenith, and the normal in world axes (three).
+    degrees (three), the noise (three), the cosine of the zenith, and the normal in world axes (three).
     """
     device = gaussians["means"].device
     normal = render(gaussians, view.camera, rasterize, RenderRequest(sh_degree=0)).normal
@@ -91,7 +104,7 @@ def view_sums(gaussians: Parameters, view: View, rasterize: Rasterize, least_nor
     one = torch.ones_like(x)[..., None]
     good = (reliable & ~(view.invalid | view.saturated))[..., None]
     cosine = -dot(guide, rays)[..., None]
-    columns = (one, s0, across, oblique, cosine, view.camera.to_world(guide))
+    columns = (one, s0, across, oblique, stokes_noise(view), cosine, view.camera.to_world(guide))
     target = torch.cat(columns, dim=-1) * good
     return shares(gaussians, view.camera, target.contiguous(), rasterize)
 
@@ -101,7 +114,7 @@ def samples_of(looks: Sequence[Tensor], which: slice, limits: MetalViews) -> Vie
     sums = torch.stack([look[which] for look in looks])
     weight = sums[..., 0]
     means = sums[..., 1:] / weight.clamp(min=1e-6)[..., None]
-    cosine = means[..., 9].clamp(0, 1)
+    cosine = means[..., 12].clamp(0, 1)
     counts = weight > limits.least_share * weight.amax(dim=0)
     counts &= (cosine > limits.cosines[0]) & (cosine < limits.cosines[1])
     return ViewSamples(
@@ -109,8 +122,9 @@ def samples_of(looks: Sequence[Tensor], which: slice, limits: MetalViews) -> Vie
         s0=means[..., :3],
         across=means[..., 3:6],
         oblique=means[..., 6:9],
+        noise=means[..., 9:12],
         cosine=cosine,
-        normal=means[..., 10:13],
+        normal=means[..., 13:16],
     )
 
 
