@@ -190,8 +190,7 @@ def _explained(samples: ViewSamples, largest: Tensor, weights: _Weights) -> tupl
     """Return the part [N] of U, up to ``largest``, that a hypothesis explains, and the rest [N], both beyond noise."""
     noise = weights.mean(samples.noise**2)
     beyond = weights.mean((samples.oblique.abs() - largest).clamp(min=0) ** 2)
-    within = weights.mean(samples.oblique**2) - beyond
-    return (within - noise).clamp(min=0), (beyond - noise).clamp(min=0)
+    return (weights.mean(samples.oblique**2) - beyond - noise).clamp(min=0), (beyond - noise).clamp(min=0)
 
 
 def metal_fit(samples: ViewSamples, setting: Setting) -> MetalFit:

@@ -5,7 +5,6 @@ A pixel contributes to the values of a Gaussian in proportion to the blending we
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
@@ -78,7 +77,7 @@ def stokes_noise(view: View) -> Tensor:
     if view.exposures != FOUR:
         return torch.zeros_like(view.photograph())
     i0, i45, i90, i135 = view.intensities()
-    return (i0 + i90 - i45 - i135) / math.sqrt(2)
+    return (i0 + i90 - i45 - i135) / 2**0.5
 
 
 def view_sums(gaussians: Parameters, view: View, rasterize: Rasterize, least_normal: float) -> Tensor:

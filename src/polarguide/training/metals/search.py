@@ -357,8 +357,7 @@ class MetalSearch:
     def look(self, state: TrainingState) -> None:
         """Decide which Gaussians are metals, and initialize new metals with their measured reflectance."""
         context = self._context
-        views = context.views
-        if not any(view.is_determined or view.materials is not None for view in views):
+        if not any(view.is_determined or view.materials is not None for view in context.views):
             return
         gaussians = state.gaussians
         rasterize = context.backend.rasterize
@@ -369,7 +368,7 @@ class MetalSearch:
         priors = self._priors(state.step)
         metal = decide(measured, gaussians, self.allowed(state), context.recipe.metal_rules, priors)
         reflectance = measured.reflectance
-        determined = [view for view in views if view.is_determined]
+        determined = [view for view in context.views if view.is_determined]
         gain = partial(
             light_gain, gaussians, state.light, determined, rasterize, context.shading, limits, context.memory
         )
@@ -403,10 +402,9 @@ class MetalSearch:
         """
         if not self._looks or not any(view.is_determined for view in self._context.views):
             return None
-        gaussians = state.gaussians
         rules = self._context.recipe.metal_rules
-        opposite = decide(self._measure(state), gaussians, self.allowed(state), rules, (-1.0,))
-        return (opposite > 0) & (gaussians["metalness"] == 0)
+        opposite = decide(self._measure(state), state.gaussians, self.allowed(state), rules, (-1.0,))
+        return (opposite > 0) & (state.gaussians["metalness"] == 0)
 
     def _measure(self, state: TrainingState) -> MetalEvidence:
         context = self._context
