@@ -10,6 +10,8 @@ from metal_balls import gaussians_of_the_ball, views_of
 from torch import Tensor
 
 from polarguide import optics
+from polarguide.capture import View
+from polarguide.capture.exposures import Exposure
 from polarguide.raster.cpu import rasterize_cpu
 from polarguide.training.metals.hypotheses import (
     NOISE,
@@ -220,21 +222,28 @@ def test_polarization_by_noise_is_no_evidence() -> None:
     assert bool((metal_fit(mirrored, SETTING).error < expected).all())
 
 
-def test_four_angles_determine_the_noise_of_the_stokes_vector() -> None:
-    view = views_of("gray", 0.0)[0]
-    clean = stokes_noise(view)
-    assert float(clean.abs().max()) < 1e-4
+@pytest.mark.parametrize("angles", [(0, 45, 90, 135), (0, 30, 60, 90, 120, 150), (10, 40, 100, 130, 170)])
+def test_redundant_pictures_determine_the_noise_of_the_stokes_vector(angles: tuple[int, ...]) -> None:
+    four = views_of("gray", 0.0)[0]
+    stokes = four.stokes()
     generator = torch.Generator().manual_seed(2)
-    codes = view.codes.to(torch.int32) // 2 + 8000
-    changes = torch.randint(-400, 401, codes.shape, generator=generator, dtype=torch.int32)
-    first, second = (
-        replace(view, pictures=(codes + change).to(view.codes.dtype))
-        for change in (torch.zeros_like(changes), changes)
-    )
-    difference = second.stokes()[1] - first.stokes()[1]
-    assert float(stokes_noise(second).std()) == pytest.approx(float(difference.std()), rel=0.05)
-    single = replace(view, pictures=view.codes[:1], exposures=view.exposures[:1])
-    assert not bool(stokes_noise(single).any())
+
+    def view(noise: float) -> View:
+        pictures = torch.stack([optics.intensity(stokes, math.radians(angle)) for angle in angles])
+        pictures = 0.2 + 0.5 * pictures + noise * torch.randn(pictures.shape, generator=generator)
+        exposures = tuple(Exposure(float(angle)) for angle in angles)
+        return replace(four, pictures=(65535 * pictures).round().to(four.codes.dtype), exposures=exposures)
+
+    assert float(stokes_noise(view(0.0)).abs().max()) < 1e-4
+    clean, noisy = view(0.0), view(0.02)
+    differences = (noisy.stokes() - clean.stokes())[1:]
+    assert float(stokes_noise(noisy).std()) == pytest.approx(float(differences.std()), rel=0.05)
+
+
+def test_three_pictures_do_not_determine_the_noise() -> None:
+    view = views_of("gray", 0.0)[0]
+    three = replace(view, pictures=view.codes[:3], exposures=view.exposures[:3])
+    torch.testing.assert_close(stokes_noise(three), three.stokes()[0])
 
 
 def test_surfaces_in_too_few_views_give_no_evidence() -> None:

@@ -14,8 +14,9 @@ Unpolarized light has no U. Polarized light changes P about as much as U. A meta
 ``conductor_oblique_share`` of U (aluminum 0.98 at 45 degrees and 0.91 at 60; copper and gold 0.57 at 60 and 0.1 at 70).
 A dielectric preserves at most ``sqrt(Rs Rp)`` times the light of the scene. Under each hypothesis, the explained part
 of U reduces the error in P, and the rest of U is added as an error. Noise also causes U. It explains nothing and is no
-error, so both parts lose the variance of the noise, which four angles determine (``ViewSamples.noise``). Without this,
-the U of textured or noisy pictures would be evidence for metals, which explain more of U than dielectrics.
+error, so both parts lose the variance of the noise, which four angles determine (``ViewSamples.noise``). With three
+angles, U is not used. Without this, the U of textured or noisy pictures would be evidence for metals, which explain
+more of U than dielectrics.
 
 **Brightness.** A metal mirrors light of the scene, so that observed color over reflectance has the brightness of the
 scene. The logarithm of its brightness is normal, with the mean and the variance of all pixels of the pictures. A metal

@@ -14,7 +14,7 @@ from torch import Tensor
 from polarguide import optics
 from polarguide._native import MAX_CHANNELS
 from polarguide.capture import View
-from polarguide.capture.exposures import FOUR
+from polarguide.capture.exposures import nominal
 from polarguide.core.system import UNBOUNDED, MemoryBound
 from polarguide.gaussians.gaussians import any_nonzero
 from polarguide.geometry.camera import Camera
@@ -37,8 +37,9 @@ class ViewSamples(NamedTuple):
         s0: [V, N, 3] mean S0.
         across: [V, N, 3] mean polarization P across the plane of incidence.
         oblique: [V, N, 3] mean polarization at 45 degrees to that plane.
-        noise: [V, N, 3] mean of ``(I0 + I90 - I45 - I135) / sqrt(2)``, which is zero without noise. With independent
-            noise on the four intensities, its variance is that of S1 and S2. It is 0 in views without these angles.
+        noise: [V, N, 3] mean of a combination of the pictures that is zero for any Stokes vector, such as
+            ``(I0 + I90 - I45 - I135) / sqrt(2)``. With independent noise on the pictures, its variance is that of S1
+            and S2. Three pictures have no such combination. The mean is then that of S0, which exceeds any noise.
         cosine: [V, N] mean cosine of the zenith angle.
         normal: [V, N, 3] mean rendered normal, in world axes.
     """
@@ -74,10 +75,14 @@ def shares(gaussians: Parameters, camera: Camera, target: Tensor, rasterize: Ras
 
 def stokes_noise(view: View) -> Tensor:
     """Return a sample [H, W, 3] of the noise of S1 and S2 in each pixel, as ``ViewSamples.noise`` describes."""
-    if view.exposures != FOUR:
-        return torch.zeros_like(view.photograph())
-    i0, i45, i90, i135 = view.intensities()
-    return (i0 + i90 - i45 - i135) / 2**0.5
+    known = [place for place, exposure in enumerate(view.exposures) if exposure.known]
+    if len(known) < 4:
+        return view.stokes()[0]
+    angles = nominal([view.exposures[place] for place in known])
+    design = 0.5 * torch.cat((torch.ones_like(angles[:, :1]), angles), dim=1)
+    variance = torch.linalg.inv(design.T @ design).diagonal()[1:].mean()
+    weights = torch.linalg.svd(design).U[:, -1] * variance.sqrt()  # zero for any Stokes vector
+    return torch.einsum("k,khwc->hwc", weights.to(view.device, torch.float32), view.intensities()[known])
 
 
 def view_sums(gaussians: Parameters, view: View, rasterize: Rasterize, least_normal: float) -> Tensor:

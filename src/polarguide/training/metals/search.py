@@ -360,8 +360,6 @@ class MetalSearch:
         if not any(view.is_determined or view.materials is not None for view in context.views):
             return
         gaussians = state.gaussians
-        rasterize = context.backend.rasterize
-        limits = context.recipe.metal_views
         measured = self._measure(state)
         if not self._warned:
             self._warn_of_contradictions(gaussians, measured.labels)
@@ -370,7 +368,14 @@ class MetalSearch:
         reflectance = measured.reflectance
         determined = [view for view in context.views if view.is_determined]
         gain = partial(
-            light_gain, gaussians, state.light, determined, rasterize, context.shading, limits, context.memory
+            light_gain,
+            gaussians,
+            state.light,
+            determined,
+            context.backend.rasterize,
+            context.shading,
+            context.recipe.metal_views,
+            context.memory,
         )
         cubemap = radiance_cubemap(context.shading)
         if cubemap is not None:
@@ -381,9 +386,14 @@ class MetalSearch:
     def _warn_of_contradictions(self, gaussians: Gaussians, labels: Tensor) -> None:
         """Warn once about views whose labels contradict other views."""
         context = self._context
-        limits = context.recipe.metal_views
-        rasterize = context.backend.rasterize
-        wrong = contradicted(gaussians, context.views, rasterize, labels, limits, context.memory)
+        wrong = contradicted(
+            gaussians,
+            context.views,
+            context.backend.rasterize,
+            labels,
+            context.recipe.metal_views,
+            context.memory,
+        )
         if not wrong:
             return
         self._warned = True
