@@ -133,6 +133,19 @@ def test_balls_of_metal_are_found_and_no_others_also_in_polarized_light(material
     assert not bool(found(ball, views, allowed=False).any())
 
 
+@pytest.mark.parametrize("material", ["gold", "aluminum", *BODIES])
+def test_noise_makes_no_metal(material: str) -> None:
+    """Noise of 5 % of full scale polarizes pixels at random. Bright metals are still found."""
+    generator = torch.Generator().manual_seed(0)
+    views = []
+    for view in views_of(material):
+        codes = view.codes.to(torch.float32)
+        noisy = codes + 0.05 * 65535 * torch.randn(codes.shape, generator=generator)
+        views.append(dataclasses.replace(view, pictures=noisy.clamp(0, 65535).round().to(view.codes.dtype)))
+    share = float(found(gaussians_of_the_ball(), views).float().mean())
+    assert share > 0.8 if material in METALS else share < 0.02
+
+
 @pytest.mark.parametrize(
     ("material", "other", "most"), [("aluminum", "black", 0.02), ("chromium", "red", 0.005)]
 )
