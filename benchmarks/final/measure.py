@@ -21,7 +21,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import shlex
 import sys
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping
@@ -236,7 +235,7 @@ def measure(
             ),
             seeds_of=missing,
             steps_of={name: steps for name, steps in part.steps_of.items() if name in missing},
-            command_line=shlex.join(["python", *sys.argv]),
+            command_line=f"python benchmarks/final/measure.py SCENES OUT --parts {path.parent.name}",
             reporter=ConsoleReporter(),
         )
     finally:
