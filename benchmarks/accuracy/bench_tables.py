@@ -13,6 +13,7 @@ import math
 import statistics
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 from bench_records import (
     BY_KEY,
@@ -28,7 +29,7 @@ from bench_records import (
     read_scenes,
     values,
 )
-from losses import LAYERS, NORMALS, bad_views, gain_table, loss_tables, without_polarization
+from losses import LAYERS, METALS, NORMALS, bad_views, gain_table, loss_tables, without_polarization
 from scipy import stats
 
 from polarguide.core.errors import PolarguideError, require
@@ -56,6 +57,8 @@ COLUMNS = {
 """Heading of each metric in the tables of scenes and means."""
 RECIPE = "polarguide-stokes"
 BASELINE = "3dgs-dr"
+FALSE_METAL = 1.0
+"""Share of a dielectric that is metal, in percent, above which it is listed."""
 CONTROLS = (f"{RECIPE}:unpolarized", f"{RECIPE}:unpolarized-without-consistency")
 
 
@@ -162,6 +165,46 @@ def object_table(rows: Rows) -> Iterator[str]:
         yield f"| {name} | {part['material']} | {' | '.join(cells)} |"
 
 
+def metal_table(scenes: Scenes) -> Iterator[str]:
+    """Yield a table of the metals of each scene, and of dielectrics of which at least ``FALSE_METAL`` is metal.
+
+    Shares of pixels have one value per seed. Layers are means over the seeds of the first control and the recipe.
+    """
+    yield "| scene | object | material | metal (%) | undecided (%) | specular (dB) | diffuse (dB) |"
+    yield "|---|---|---|---|---|---|---|"
+    for scene, rows in scenes.items():
+        for name, part in objects_of(rows, RECIPE).items():
+            found = shares(rows, name, "metal_share")
+            if not found or (part["material"] not in METALS and max(found) < FALSE_METAL):
+                continue
+            cells = [", ".join(f"{share:.0f}" for share in found)]
+            cells.append(", ".join(f"{share:.0f}" for share in shares(rows, name, "undecided_share")))
+            for key in LAYERS:
+                pair = [
+                    values(rows.get(of, {}), of_object(name, key)).values() for of in (CONTROLS[0], RECIPE)
+                ]
+                cells.append(" / ".join(f"{statistics.fmean(v):.1f}" if v else "n/a" for v in pair))
+            yield f"| `{scene}` | {name} | {part['material']} | {' | '.join(cells)} |"
+        falsely = [
+            f"{100 * share:.1f}" for share in map(false_metal, rows[RECIPE].values()) if share is not None
+        ]
+        if falsely:
+            yield f"| `{scene}` | all dielectrics | | {', '.join(falsely)} | | | |"
+
+
+def shares(rows: Rows, name: str, key: str) -> list[float]:
+    """Return a share of the pixels of an object in percent, by seed."""
+    return [100 * share for share in values(rows[RECIPE], of_object(name, key)).values()]
+
+
+def false_metal(run: Any) -> float | None:
+    """Return the share of the pixels of all dielectrics of a run that are metal; None without dielectrics."""
+    parts = [part for material, part in (run["materials"] or {}).items() if material not in METALS]
+    known = [part for part in parts if part["metrics"].get("metal_share") is not None]
+    pixels = sum(part["pixels"] for part in known)
+    return sum(part["pixels"] * part["metrics"]["metal_share"] for part in known) / pixels if pixels else None
+
+
 def shown_columns(scenes: Scenes) -> dict[str, str]:
     """Return the columns in which any run has a value."""
     runs = [run for rows in scenes.values() for seeds in rows.values() for run in seeds.values()]
@@ -181,6 +224,7 @@ def tables(scenes: Scenes, others: Sequence[str]) -> Iterator[str]:
         yield from ("\n## Mean gains\n", *gain_table(ours, RECIPE, others))
         yield from ("\n## By material\n", *material_table(ours))
         yield from ("\n## Gain by polarization\n", *control_table(ours))
+        yield from ("\n## Metals\n", *metal_table(ours))
     yield from ("\n## Mean over scenes\n", *mean_table(scenes))
     for scene, rows in scenes.items():
         yield from (f"\n## {scene}\n", *scene_table(rows), "")

@@ -6,7 +6,8 @@
     done
     python benchmarks/front/front_pictures.py SCENE RUNS --view v016
 
-Writes ``docs/images/front.jpg``. Pictures have the size of the scene's pictures, at any size of the training.
+Writes ``docs/images/front.jpg``. With ``--recipes`` and ``--out``, it draws other recipes to another file. Pictures
+have the size of the scene's pictures, at any size of the training.
 """
 
 from __future__ import annotations
@@ -61,9 +62,10 @@ def main() -> None:
     parser.add_argument("scene", type=Path)
     parser.add_argument("runs", type=Path, help="a folder with a run of each recipe, by its name")
     parser.add_argument("--view", required=True, help="a held-out view")
+    parser.add_argument("--recipes", nargs="+", default=RECIPES)
     parser.add_argument("--out", type=Path, default=IMAGES / "front.jpg")
     given = parser.parse_args()
-    runs = {recipe: pg.open_run(given.runs / recipe) for recipe in RECIPES}
+    runs = {recipe: pg.open_run(given.runs / recipe) for recipe in given.recipes}
     picture = Image.fromarray(sheet(pg.load_scene(given.scene), runs, given.view))
     picture.save(given.out, quality=90)
 

@@ -1,6 +1,5 @@
 """Tables of docs/results, computed again from the records in benchmarks/results."""
 
-import json
 import sys
 from pathlib import Path
 from statistics import fmean
@@ -22,6 +21,8 @@ from bench_records import of_run, read_scenes, values  # noqa: E402
 DEVELOPMENT = ("figure", "kit", "car", "water", "metals-a", "ceramic-a")
 HELD_BACK = ("metals-b", "ceramic-b", "cup", "rough", "lacquer")
 FOUR = ("spheres", "cup", "car", "water")
+NEW = ("workbench", "sideboard", "pantry", "picnic", "bathroom", "tortoise")
+NEW_FOLDER = "final/heldout"
 LAYERS = {"specular": "specular PSNR", "diffuse": "diffuse PSNR"}
 WITHOUT_METALS = {name: f"{heading} without metals" for name, heading in LAYERS.items()}
 OTHERS = losses.without_polarization(bench_tables.RECIPE)
@@ -73,7 +74,7 @@ def assert_equal_tables(stated, computed, names):
         ("index", ("recipe, eleven scenes",), "bench", (*DEVELOPMENT, *HELD_BACK), WITHOUT_METALS),
         ("index", ("recipe, four scenes",), "four", FOUR, LAYERS),
         ("index", ("recipe", "PSNR", "Stokes error"), "four", ("wwbottle",), {}),
-        ("bench-held-back", ("recipe", "PSNR"), "bench", HELD_BACK, LAYERS),
+        ("new-scenes", ("recipe", "PSNR"), NEW_FOLDER, NEW, LAYERS),
         ("captures", ("angles of each view",), "", ("exposures",), LAYERS),
     ],
 )
@@ -83,25 +84,28 @@ def test_means_over_scenes(page, headings, folder, scenes, layers):
 
 
 def test_gains_by_scene():
-    computed = printed(bench_tables.control_table(scenes_of("bench", HELD_BACK)))
-    assert_equal_tables(page_table("bench-held-back", "scene", "PSNR"), computed, WITHOUT_METALS)
+    computed = printed(bench_tables.control_table(scenes_of(NEW_FOLDER, NEW)))
+    assert_equal_tables(page_table("new-scenes", "scene", "PSNR"), computed, WITHOUT_METALS)
 
 
-def test_values_by_material():
-    (table,) = tables_of(bench_tables.material_table(scenes_of("bench", (*DEVELOPMENT, *HELD_BACK))))
-    stated = page_table("index", "material", "normal error (deg)")
+@pytest.mark.parametrize(
+    ("page", "folder", "scenes"),
+    [("index", "bench", (*DEVELOPMENT, *HELD_BACK)), ("new-scenes", NEW_FOLDER, NEW)],
+)
+def test_values_by_material(page, folder, scenes):
+    (table,) = tables_of(bench_tables.material_table(scenes_of(folder, scenes)))
+    stated = page_table(page, "material", "normal error (deg)")
     assert [[*row.values()] for row in stated] == [[*row.values()] for row in table]
 
 
 def test_losses():
-    scenes = scenes_of("bench", (*HELD_BACK, *DEVELOPMENT))
-    lines = list(losses.loss_tables(scenes, bench_tables.RECIPE, OTHERS))
+    lines = list(losses.loss_tables(scenes_of(NEW_FOLDER, NEW), bench_tables.RECIPE, OTHERS))
     by_scene, by_method, _ = tables_of(lines)
-    page = page_table("bench-held-back", "scene", "losses by scene")
-    assert {tuple(row.values())[:3] for row in page} == {tuple(row.values()) for row in by_scene}
-    method = page_table("bench-held-back", "method", "losses")
-    assert [tuple(row.values()) for row in method] == [tuple(row.values()) for row in by_method]
-    text = " ".join((ROOT / "docs" / "results" / "bench-held-back.md").read_text(encoding="utf-8").split())
+    stated = page_table("new-scenes", "scene", "losses by scene")
+    assert [[*row.values()] for row in stated] == [[*row.values()] for row in by_scene]
+    method = page_table("new-scenes", "method", "losses")
+    assert [[*row.values()] for row in method] == [[*row.values()] for row in by_method]
+    text = " ".join((ROOT / "docs" / "results" / "new-scenes.md").read_text(encoding="utf-8").split())
     assert lines[0] in text
 
 
@@ -112,18 +116,16 @@ def test_an_unknown_recipe_is_refused():
         bench_tables.check_recipes(scenes, ["3dgs", "3dgss"])
 
 
-def test_mean_gains():
-    halves = {"held back": HELD_BACK, "all eleven": (*DEVELOPMENT, *HELD_BACK)}
-    computed = {
-        half: printed(losses.gain_table(scenes_of("bench", names), bench_tables.RECIPE, OTHERS))
-        for half, names in halves.items()
-    }
-    name = ""
-    for row in page_table("bench-held-back", "`polarguide-stokes` compared with"):
-        _, half, *cells = row.values()
-        name = next(iter(row.values())).removeprefix("its control ") or name
-        label = name.replace("`:", "`polarguide-stokes:")
-        assert [*computed[half][label].values()][1:] == cells
+def test_metals_of_new_scenes():
+    (table,) = tables_of(bench_tables.metal_table(scenes_of(NEW_FOLDER, NEW)))
+    stated = page_table("new-scenes", "scene", "object")
+    assert [[*row.values()] for row in stated] == [[*row.values()] for row in table]
+
+
+def test_mean_gains_on_new_scenes():
+    (table,) = tables_of(losses.gain_table(scenes_of(NEW_FOLDER, NEW), bench_tables.RECIPE, OTHERS))
+    stated = page_table("new-scenes", "compared with")
+    assert [[*row.values()] for row in stated] == [[*row.values()] for row in table]
 
 
 @pytest.mark.parametrize(
@@ -157,16 +159,6 @@ def test_five_values_of_the_publication():
         ]
         assert cells == [" / ".join(f"{value:.1f}" for value in of) for of in computed]
         assert mean == " / ".join(f"{fmean(of):.1f}" for of in zip(*computed, strict=True))
-
-
-def test_polgs():
-    runs = json.loads((ROOT / "benchmarks" / "records" / "polgs.json").read_text(encoding="utf-8"))["runs"]
-    keys = {**dict.fromkeys(FIVE, 1), "stokes_error": 2, "depth_error_median_percent": 2}
-    for row in page_table("index", "recipe, half size"):
-        recipe, *cells = (cell.strip("`") for cell in row.values())
-        of_recipe = [run for name, run in runs.items() if name.split("/")[1] == recipe]
-        assert len(of_recipe) == 12
-        assert cells == [f"{fmean(run[key] for run in of_recipe):.{digits}f}" for key, digits in keys.items()]
 
 
 def test_normals_of_gnerp():
