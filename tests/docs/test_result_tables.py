@@ -107,6 +107,8 @@ def test_losses():
     assert [[*row.values()] for row in method] == [[*row.values()] for row in by_method]
     text = " ".join((ROOT / "docs" / "results" / "new-scenes.md").read_text(encoding="utf-8").split())
     assert lines[0] in text
+    for stating in ("README.md", "docs/results/index.md"):
+        assert f"loses {by_method[0]['losses']} comparisons" in (ROOT / stating).read_text(encoding="utf-8")
 
 
 def test_an_unknown_recipe_is_refused():
