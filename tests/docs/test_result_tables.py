@@ -23,6 +23,7 @@ HELD_BACK = ("metals-b", "ceramic-b", "cup", "rough", "lacquer")
 FOUR = ("spheres", "cup", "car", "water")
 NEW = ("workbench", "sideboard", "pantry", "picnic", "bathroom", "tortoise")
 NEW_FOLDER = "final/heldout"
+METALS = {"final/bench": ("kit", "metals-a", "metals-b"), "final/metals": ("alloys",)}
 LAYERS = {"specular": "specular PSNR", "diffuse": "diffuse PSNR"}
 WITHOUT_METALS = {name: f"{heading} without metals" for name, heading in LAYERS.items()}
 OTHERS = losses.without_polarization(bench_tables.RECIPE)
@@ -73,6 +74,7 @@ def assert_equal_tables(stated, computed, names):
     [
         ("index", ("recipe, eleven scenes",), "bench", (*DEVELOPMENT, *HELD_BACK), WITHOUT_METALS),
         ("index", ("recipe, four scenes",), "four", FOUR, LAYERS),
+        ("index", ("recipe, three seeds",), "final/four", FOUR, LAYERS),
         ("index", ("recipe", "PSNR", "Stokes error"), "four", ("wwbottle",), {}),
         ("new-scenes", ("recipe", "PSNR"), NEW_FOLDER, NEW, LAYERS),
         ("captures", ("angles of each view",), "", ("exposures",), LAYERS),
@@ -83,9 +85,16 @@ def test_means_over_scenes(page, headings, folder, scenes, layers):
     assert_equal_tables(page_table(page, *headings), computed, layers)
 
 
-def test_gains_by_scene():
-    computed = printed(bench_tables.control_table(scenes_of(NEW_FOLDER, NEW)))
-    assert_equal_tables(page_table("new-scenes", "scene", "PSNR"), computed, WITHOUT_METALS)
+@pytest.mark.parametrize(
+    ("page", "heading", "folder", "scenes", "layers"),
+    [
+        ("new-scenes", "scene", NEW_FOLDER, NEW, WITHOUT_METALS),
+        ("index", "scene, gain by polarization", "final/four", FOUR, LAYERS),
+    ],
+)
+def test_gains_by_scene(page, heading, folder, scenes, layers):
+    computed = printed(bench_tables.control_table(scenes_of(folder, scenes)))
+    assert_equal_tables(page_table(page, heading, "PSNR"), computed, layers)
 
 
 @pytest.mark.parametrize(
@@ -111,6 +120,12 @@ def test_losses():
         assert f"loses {by_method[0]['losses']} comparisons" in (ROOT / stating).read_text(encoding="utf-8")
 
 
+def test_losses_of_four_scenes():
+    first = next(losses.loss_tables(scenes_of("final/four", FOUR), bench_tables.RECIPE, OTHERS))
+    text = " ".join((ROOT / "docs" / "results" / "index.md").read_text(encoding="utf-8").split())
+    assert f"{first.removesuffix('.')} to this control" in text
+
+
 def test_an_unknown_recipe_is_refused():
     scenes = scenes_of("bench", ["cup"])
     bench_tables.check_recipes(scenes, ["3dgs", "ref-gs"])
@@ -118,9 +133,16 @@ def test_an_unknown_recipe_is_refused():
         bench_tables.check_recipes(scenes, ["3dgs", "3dgss"])
 
 
-def test_metals_of_new_scenes():
-    (table,) = tables_of(bench_tables.metal_table(scenes_of(NEW_FOLDER, NEW)))
-    stated = page_table("new-scenes", "scene", "object")
+@pytest.mark.parametrize(
+    ("page", "scenes_by_folder"),
+    [("new-scenes", {NEW_FOLDER: NEW}), ("metals", METALS)],
+)
+def test_metals(page, scenes_by_folder):
+    scenes = {}
+    for folder, names in scenes_by_folder.items():
+        scenes.update(scenes_of(folder, names))
+    (table,) = tables_of(bench_tables.metal_table(scenes))
+    stated = page_table(page, "scene", "object")
     assert [[*row.values()] for row in stated] == [[*row.values()] for row in table]
 
 
