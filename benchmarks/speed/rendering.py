@@ -77,7 +77,7 @@ def measure(opened: Run, rounds: int, size: tuple[int, int] | None, threads: int
     ]
     camera = cameras[0]
     print(
-        f"| {opened.folder.name} | {opened.recipe.name} | {threads} | {camera.width} x {camera.height} "
+        f"| {opened.scene.name} | {opened.recipe.name} | {threads} | {camera.width} x {camera.height} "
         f"| {len(rows):,} | "
         + "".join(f"{median[way.__name__]:.1f} | " for way in ways)
         + " | ".join(f"{ratio:.2f}" for ratio in ratios)
@@ -97,7 +97,7 @@ def main() -> None:
     keep_freed_memory()  # as the command line does
     print(f"{_native.simd()}\n")
     print(
-        "| run | recipe | threads | size | Gaussians | color ms | layers ms | with depth ms | of the surface ms "
+        "| scene | recipe | threads | size | Gaussians | color ms | layers ms | with depth ms | of the surface ms "
         "| ratio | with depth | of the surface |"
     )
     print("|---|---|---|---|---|---|---|---|---|---|---|---|")
