@@ -144,7 +144,10 @@ def main() -> None:
             recipe = run.recipe if run is not None else recipe_named(name)
             state = load_checkpoint(options.source, recipe) if run is not None else None
             if state is not None:
-                state.drop("frozen.")
+                # Without its guide, the training computes the priors of each view again.
+                state.extra = {
+                    name: values for name, values in state.extra.items() if not name.startswith("frozen.")
+                }
             settings = resolve(TrainSettings(5000, 0), scene, recipe)
             context = TrainingContext(scene, recipe, settings, choose_backend("cpu"))
             trainer, _ = gaussian_training(context, state)

@@ -123,7 +123,9 @@ def workers(
             )
             yield Workers(client, count, _cluster=cluster)
             return
-        # Local workers are threads of this process, since each job has its own process. They open no port.
+        # Local workers are threads of this process, since each job has its own process. They open no port. They cannot
+        # be lost, and a scheduler that waits for signs of life would remove them after a suspension of this machine.
+        stack.enter_context(dask.config.set({"distributed.scheduler.worker-ttl": None}))
         cluster = stack.enter_context(
             LocalCluster(
                 n_workers=count,

@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import pytest
@@ -160,6 +161,22 @@ def interrupt_when(*conditions: Callable[[], bool]) -> threading.Thread:
     thread = threading.Thread(target=wait)
     thread.start()
     return thread
+
+
+def test_workers_survive_a_suspension(two: Workers, job: Callable[..., Job]) -> None:
+    """A machine that slept for an hour, or Ctrl-Z and fg."""
+
+    async def sleep(dask_scheduler: Any) -> None:
+        for state in dask_scheduler.workers.values():
+            state.last_seen -= 3600
+        if dask_scheduler.worker_ttl:
+            await dask_scheduler.check_worker_ttl()
+
+    two.client.run_on_scheduler(sleep)
+    assert two.slots() == 2
+    watch = Watch()
+    run_jobs([job("a", "eval")], two, reporter=watch, on_end=watch.end)
+    assert watch.ended == {"a": None}
 
 
 def test_ctrl_c_asks_every_child_and_waits(two: Workers, job: Callable[..., Job]) -> None:

@@ -170,6 +170,37 @@ def test_tables_of_the_publication(layout, last):
     assert [[*row.values()] for row in page_table("publication", *headings)] == computed
 
 
+def recorded_speed():
+    """Tables of the record of speeds: of the steps by recipe and scene, and of renderings."""
+    lines = (ROOT / "benchmarks" / "records" / "speed.md").read_text(encoding="utf-8").splitlines()
+    titles = [line.split(",", 1) for line in lines if " trained Gaussians, " in line]
+    tables = tables_of(lines)
+    parts = [{row["part"]: row for row in table} for table in tables[: len(titles)]]
+    steps = {
+        title: {"Gaussians": more.split(",", 1)[1].split(" trained")[0].strip(), **rows}
+        for (title, more), rows in zip(titles, parts, strict=True)
+    }
+    return steps, [row for table in tables[len(titles) :] for row in table]
+
+
+def test_speed_of_steps():
+    steps, _ = recorded_speed()
+    for row in page_table("speed", "recipe", "Gaussians"):
+        recipe, _, scene = row["recipe"].partition(" on ")
+        recorded = steps[f"{recipe.strip('`')} on {scene.strip('`') or 'spheres'}"]
+        whole = recorded["whole step"]
+        assert [*row.values()][1:] == [recorded["Gaussians"], whole["1 thread"], whole["2 threads"]]
+    for row in page_table("speed", "part", "`spheres`"):
+        scenes = (steps[f"polarguide-stokes on {scene}"] for scene in ("spheres", "car"))
+        assert [*row.values()][1:] == [recorded[row["part"]]["1 thread"] for recorded in scenes]
+
+
+def test_speed_of_rendering():
+    _, recorded = recorded_speed()
+    stated = page_table("speed", "scene", "recipe", "threads")
+    assert [row for row in stated if row not in [{key: full[key] for key in row} for full in recorded]] == []
+
+
 FIVE = ("psnr", "psnr_foreground", "normal_mae_deg", "specular_psnr", "diffuse_psnr")
 
 
