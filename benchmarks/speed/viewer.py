@@ -1,8 +1,7 @@
 """Measure the pictures per second of the viewer while the camera moves: drawn, encoded, and sent to an idle browser.
 
-``python benchmarks/speed/viewer.py RUN [--gaussians 50000] [--size 480x360]``. Run it without other work on the
-machine. The camera follows an orbit, one pose per picture, at a fixed size. The Gaussians are a random choice of the
-run's. If the run has too few, some are repeated.
+``python benchmarks/speed/viewer.py RUN [--size 480x360]``. Run it without other work on the machine. The camera follows
+an orbit, one pose per picture, at a fixed size.
 """
 
 from __future__ import annotations
@@ -11,7 +10,6 @@ import argparse
 import os
 import statistics
 import time
-from dataclasses import replace
 from pathlib import Path
 
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as the command line does, before torch is imported
@@ -20,7 +18,6 @@ import cv2
 import torch
 
 from polarguide import open_run
-from polarguide.gaussians.gaussians import Gaussians
 from polarguide.geometry.camera_path import orbit
 from polarguide.geometry.scene_frame import scene_frame
 from polarguide.shading.result import LAYERS
@@ -35,24 +32,15 @@ def main() -> None:
     """Measure and print a table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("run", type=Path)
-    parser.add_argument("--gaussians", type=int, default=50_000)
     parser.add_argument("--size", default="480x360")
     parser.add_argument("--pictures", type=int, default=40)
     arguments = parser.parse_args()
     width, height = (int(side) for side in arguments.size.split("x"))
     opened = open_run(arguments.run)
     shown = run_scenery(opened)
-    generator = torch.Generator().manual_seed(0)
-    chosen = torch.randint(len(shown.gaussians), (arguments.gaussians,), generator=generator)
-    if arguments.gaussians <= len(shown.gaussians):
-        chosen = torch.randperm(len(shown.gaussians), generator=generator)[: arguments.gaussians]
-    rows = {name: shown.gaussians[name].detach()[chosen] for name in shown.gaussians.names}
-    shown = replace(shown, gaussians=Gaussians(rows, opened.recipe.rates))
     cameras = list(opened.cameras.values())
     path = [c.extended(width, height) for c in orbit(cameras, arguments.pictures + SKIPPED)]
-    print(
-        f"{shown.status}; {len(shown.gaussians):,} of them, {width} x {height}, {torch.get_num_threads()} threads"
-    )
+    print(f"{shown.status} on {opened.scene.name}, {width} x {height}, {torch.get_num_threads()} threads")
     print("layer        ms (10 % to 90 %)   pictures per second")
     for layer in LAYERS:
         painter, seconds = Painter(scene_frame(cameras)), []
