@@ -1,6 +1,6 @@
 """Compare the peak resident memory of a training with its plan.
 
-    python benchmarks/speed/memory.py SCENE [--downscale 4 2 1] [--memory 0 4GB] [--steps 24]
+    python benchmarks/speed/memory.py SCENE [--downscale 4 2 1] [--memory 1TB 4GB] [--steps 24]
 
 Each row is a process of ``polarguide train`` with the peak that the system reports at its end. With few steps there are
 few Gaussians and unvisited views. Give 1.5 times as many steps as a training of the scene has views.
@@ -22,7 +22,7 @@ def main() -> None:
     )
     parser.add_argument("scene", type=Path)
     parser.add_argument("--downscale", type=int, nargs="+", default=[4, 2, 1])
-    parser.add_argument("--memory", nargs="+", default=["0"])
+    parser.add_argument("--memory", nargs="+", default=["1TB"], help="limits; 1TB keeps everything in memory")
     parser.add_argument("--steps", type=int, default=24)
     parser.add_argument("--recipe", default="polarguide-stokes")
     options = parser.parse_args()
