@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,8 @@ METRICS = ("psnr", "normal_mae_deg", "specular_psnr", "diffuse_psnr")
 WHOLE = "all"
 DIELECTRICS = "layers without metals"
 ONE_PERCENT = 1.0
+FOUND_SHARE = 0.5
+"""Share of an object's pixels that a run must classify as metal, for the object to count as a found metal."""
 Scores = dict[str, dict[str, float | None]]
 """Scores by object, and of the whole scene."""
 
@@ -75,6 +77,45 @@ def table(having: dict[str, Scores], lacking: dict[str, Scores]) -> list[str]:
     return [f"{len(seeds)} seeds", "", *lines] if seeds else ["no seed that both have"]
 
 
+def summary(record: dict[str, dict[str, dict[str, Scores]]]) -> Iterator[str]:
+    """Yield a table by scene: gains of the layers of found metals and of dielectrics, and of the other objects' PSNR.
+
+    Metals have the smallest and the largest gain. The PSNR is a mean over objects.
+    """
+    yield (
+        "| scene | found metals | specular | diffuse | dielectrics, specular | dielectrics, diffuse "
+        "| other objects, PSNR |"
+    )
+    yield "|---|---|---|---|---|---|---|"
+    for scene, runs in record["runs"].items():
+        seeds = sorted(runs.keys() & record["less"].get(scene, {}).keys())
+        having, lacking = ([record[side][scene][seed] for seed in seeds] for side in ("runs", "less"))
+        metals = [
+            name
+            for name in (having[0] if seeds else ())
+            if max(scores[name]["metal_share"] or 0.0 for scores in having) >= FOUND_SHARE
+        ]
+        if not metals:
+            continue
+        cells = [str(len(metals))]
+        for key in METRICS[2:]:
+            gains = sorted(
+                float(np.mean([a[name][key] - b[name][key] for a, b in zip(having, lacking, strict=True)]))  # type: ignore[operator]
+                for name in metals
+            )
+            cells.append(" to ".join(dict.fromkeys(f"{gain:+.1f}" for gain in (gains[0], gains[-1]))))
+        for key in METRICS[2:]:
+            values = ([scores[DIELECTRICS][key] for scores in side] for side in (having, lacking))
+            cells.append(difference(*values))
+        others = having[0].keys() - {*metals, WHOLE, DIELECTRICS}
+        pictures = (
+            [np.mean([scores[name][METRICS[0]] for name in others]) for scores in side]  # type: ignore[arg-type]
+            for side in (having, lacking)
+        )
+        cells.append(difference(*pictures))
+        yield f"| `{scene}` | {' | '.join(cells)} |"
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -91,6 +132,7 @@ def main() -> None:
         record = json.loads(options.record.read_text(encoding="utf-8"))
     else:
         parser.error("give both --runs and --less, or a --record alone")
+    print("\n".join(summary(record)))
     for scene, having in record["runs"].items():
         print(f"\n{scene}: " + "\n".join(table(having, record["less"].get(scene, {}))))
 

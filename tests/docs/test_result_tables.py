@@ -1,5 +1,6 @@
 """Tables of docs/results, computed again from the records in benchmarks/results."""
 
+import json
 import sys
 from pathlib import Path
 from statistics import fmean
@@ -16,6 +17,7 @@ RECORDS = ROOT / "benchmarks" / "results"
 sys.path.append(str(ROOT / "benchmarks" / "accuracy"))
 import bench_tables  # noqa: E402
 import losses  # noqa: E402
+import paired_runs  # noqa: E402
 from bench_records import of_run, read_scenes, values  # noqa: E402
 
 DEVELOPMENT = ("figure", "kit", "car", "water", "metals-a", "ceramic-a")
@@ -143,6 +145,15 @@ def test_metals(page, scenes_by_folder):
         scenes.update(scenes_of(folder, names))
     (table,) = tables_of(bench_tables.metal_table(scenes))
     stated = page_table(page, "scene", "object")
+    assert [[*row.values()] for row in stated] == [[*row.values()] for row in table]
+
+
+def test_gains_by_detection_of_metals():
+    record = json.loads(
+        (ROOT / "benchmarks" / "paired" / "metals-dielectric.json").read_text(encoding="utf-8")
+    )
+    (table,) = tables_of(paired_runs.summary(record))
+    stated = page_table("metals", "scene", "found metals")
     assert [[*row.values()] for row in stated] == [[*row.values()] for row in table]
 
 
