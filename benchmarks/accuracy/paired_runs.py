@@ -50,6 +50,12 @@ def collected(runs: Sequence[Path]) -> dict[str, dict[str, Scores]]:
     return found
 
 
+def code_digests(runs: Sequence[Path]) -> list[str]:
+    """Return the digests of the code that scored the runs."""
+    metrics = (json.loads((run / "metrics.json").read_text(encoding="utf-8")) for run in runs)
+    return sorted({each["provenance"]["sources"] for each in metrics})
+
+
 def difference(having: Sequence[Any], lacking: Sequence[Any]) -> str:
     """Format the mean of the paired differences, and twice their standard error for two or more."""
     if None in (*having, *lacking):
@@ -77,7 +83,7 @@ def table(having: dict[str, Scores], lacking: dict[str, Scores]) -> list[str]:
     return [f"{len(seeds)} seeds", "", *lines] if seeds else ["no seed that both have"]
 
 
-def summary(record: dict[str, dict[str, dict[str, Scores]]]) -> Iterator[str]:
+def summary(record: dict[str, Any]) -> Iterator[str]:
     """Yield a table by scene: gains of the layers of found metals and of dielectrics, and of the other objects' PSNR.
 
     Metals have the smallest and the largest gain. The PSNR is a mean over objects.
@@ -100,7 +106,7 @@ def summary(record: dict[str, dict[str, dict[str, Scores]]]) -> Iterator[str]:
         cells = [str(len(metals))]
         for key in METRICS[2:]:
             gains = sorted(
-                float(np.mean([a[name][key] - b[name][key] for a, b in zip(having, lacking, strict=True)]))  # type: ignore[operator]
+                float(np.mean([a[name][key] - b[name][key] for a, b in zip(having, lacking, strict=True)]))
                 for name in metals
             )
             cells.append(" to ".join(dict.fromkeys(f"{gain:+.1f}" for gain in (gains[0], gains[-1]))))
@@ -109,7 +115,7 @@ def summary(record: dict[str, dict[str, dict[str, Scores]]]) -> Iterator[str]:
             cells.append(difference(*values))
         others = having[0].keys() - {*metals, WHOLE, DIELECTRICS}
         pictures = (
-            [np.mean([scores[name][METRICS[0]] for name in others]) for scores in side]  # type: ignore[arg-type]
+            [np.mean([scores[name][METRICS[0]] for name in others]) for scores in side]
             for side in (having, lacking)
         )
         cells.append(difference(*pictures))
@@ -125,13 +131,18 @@ def main() -> None:
     parser.add_argument("--record", type=Path, default=None)
     options = parser.parse_args()
     if options.runs and options.less:
-        record = {"runs": collected(options.runs), "less": collected(options.less)}
+        record = {
+            "runs": collected(options.runs),
+            "less": collected(options.less),
+            "sources": code_digests([*options.runs, *options.less]),
+        }
         if options.record is not None:
             options.record.write_text(json.dumps(record, separators=(",", ":")) + "\n", encoding="utf-8")
     elif options.record is not None and not options.runs and not options.less:
         record = json.loads(options.record.read_text(encoding="utf-8"))
     else:
         parser.error("give both --runs and --less, or a --record alone")
+    print(f"Digest of the code: {', '.join(record.get('sources', ['unknown']))}\n")
     print("\n".join(summary(record)))
     for scene, having in record["runs"].items():
         print(f"\n{scene}: " + "\n".join(table(having, record["less"].get(scene, {}))))
