@@ -3,9 +3,10 @@
     python benchmarks/accuracy/paired_runs.py --runs RUN... --less RUN... [--record FILE]
     python benchmarks/accuracy/paired_runs.py --record FILE
 
-The runs must have scores (``polarguide eval``). For each scene and each of its objects, the table contains means of the
-differences with twice their standard error over seeds, and the scores of the layers. It also contains the share of the
-object's pixels that each run classifies as metal. ``--record`` writes the scores, or reads them without runs.
+The runs must have scores (``polarguide eval``). The first table has a line for each scene. For each scene and each of
+its objects, the next tables contain means of the differences with twice their standard error over seeds, and the scores
+of the layers. They also contain the share of the object's pixels that each run classifies as metal. ``--record`` writes
+the scores, or reads them without runs.
 """
 
 from __future__ import annotations
@@ -86,7 +87,7 @@ def table(having: dict[str, Scores], lacking: dict[str, Scores]) -> list[str]:
 def summary(record: dict[str, Any]) -> Iterator[str]:
     """Yield a table by scene: gains of the layers of found metals and of dielectrics, and of the other objects' PSNR.
 
-    Metals have the smallest and the largest gain. The PSNR is a mean over objects.
+    Several metals are summarized by their smallest and largest gain. The PSNR is a mean over objects.
     """
     yield (
         "| scene | found metals | specular | diffuse | dielectrics, specular | dielectrics, diffuse "

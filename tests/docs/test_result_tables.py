@@ -123,9 +123,13 @@ def test_losses():
 
 
 def test_losses_of_four_scenes():
-    first = next(losses.loss_tables(scenes_of("final/four", FOUR), bench_tables.RECIPE, OTHERS))
     text = " ".join((ROOT / "docs" / "results" / "index.md").read_text(encoding="utf-8").split())
+    control = [bench_tables.CONTROLS[0]]
+    first = next(losses.loss_tables(scenes_of("final/four", FOUR), bench_tables.RECIPE, control))
     assert f"{first.removesuffix('.')} to this control" in text
+    lines = losses.loss_tables(scenes_of("final/four", ["spheres"]), bench_tables.RECIPE, OTHERS)
+    _, by_method, _ = tables_of(list(lines))
+    assert f"`spheres` only: {by_method[0]['losses']} comparisons with the best of six" in text
 
 
 def test_an_unknown_recipe_is_refused():
