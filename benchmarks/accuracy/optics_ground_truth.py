@@ -1,6 +1,6 @@
 """Measure the accuracy of the polarization optics on rendered scenes with known normals and layers.
 
-Usage: python benchmarks/accuracy/optics_ground_truth.py SCENES_DIR [--scenes spheres cup ...] [--refractive-index 1.5]
+Usage: python benchmarks/accuracy/optics_ground_truth.py SCENES_DIR [--scenes ...] > benchmarks/records/optics.md
 
 Each scene folder contains ``polar/VIEW_ANGLE.png`` (linear, 16 bits), ``gt/VIEW.npz`` (world ``normal``,
 ``mask``, and ``specular`` and ``diffuse`` in units of S0), ``sparse/0`` (COLMAP text) and ``split.json`` with

@@ -19,6 +19,8 @@ import bench_tables  # noqa: E402
 import losses  # noqa: E402
 import paired_runs  # noqa: E402
 from bench_records import of_run, read_scenes, values  # noqa: E402
+from markdown_tables import page_table as table_of_page  # noqa: E402
+from markdown_tables import tables_of  # noqa: E402
 
 DEVELOPMENT = ("figure", "kit", "car", "water", "metals-a", "ceramic-a")
 HELD_BACK = ("metals-b", "ceramic-b", "cup", "rough", "lacquer")
@@ -35,27 +37,9 @@ def scenes_of(folder, names):
     return read_scenes([RECORDS / folder / f"{name}.json" for name in names])
 
 
-def tables_of(lines):
-    """Tables of a Markdown text: a list of rows each, with cells by heading."""
-    tables = []
-    header = None
-    for line in lines:
-        cells = [cell.strip() for cell in line.split("|")[1:-1]] if line[:1] == "|" else None
-        if cells is None:
-            header = None
-        elif header is None:
-            header = cells
-            tables.append([])
-        elif not line.startswith("|---"):
-            tables[-1].append(dict(zip(header, cells, strict=True)))
-    return tables
-
-
 def page_table(page, *headings):
-    """The table of a page whose first headings are these."""
-    lines = (ROOT / "docs" / "results" / f"{page}.md").read_text(encoding="utf-8").splitlines()
-    (table,) = [table for table in tables_of(lines) if tuple(table[0])[: len(headings)] == headings]
-    return table
+    """The table of a page of results whose first headings are these."""
+    return table_of_page(f"results/{page}", *headings)
 
 
 def printed(lines):
@@ -233,13 +217,7 @@ def test_five_values_of_the_publication():
 
 def test_normals_of_gnerp():
     scenes = read_scenes([RECORDS / f"gnerp{name}.json" for name in ("", "-car", "-water", "-circular")])
-    (table,) = (
-        table
-        for table in tables_of(
-            (ROOT / "docs" / "reference" / "gnerp.md").read_text(encoding="utf-8").splitlines()
-        )
-        if tuple(table[0])[:2] == ("recipe", "`spheres`")
-    )
+    table = table_of_page("reference/gnerp", "recipe", "`spheres`")
     for row in table:
         recipe = row.pop("recipe").strip("`")
         for scene, cell in row.items():

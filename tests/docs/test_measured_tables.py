@@ -1,0 +1,160 @@
+"""Tables of guides, reference and explanation, computed again from benchmarks/records."""
+
+import json
+import sys
+from pathlib import Path
+from statistics import fmean, stdev
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+RECORDS = ROOT / "benchmarks" / "records"
+sys.path.append(str(ROOT / "benchmarks" / "accuracy"))
+import capture_kinds  # noqa: E402
+import unknown_angles  # noqa: E402
+from markdown_tables import page_rows, page_table, row_lists, tables_of  # noqa: E402
+
+
+def read_json(name):
+    return json.loads((RECORDS / f"{name}.json").read_text(encoding="utf-8"))
+
+
+def recorded_rows(name):
+    """The rows of the only table of a printed record."""
+    (table,) = row_lists((RECORDS / f"{name}.md").read_text(encoding="utf-8").splitlines())
+    return table
+
+
+def seeds_of(runs, prefix, key):
+    return [run[key] for name, run in runs.items() if name.rpartition("/")[0] == prefix]
+
+
+SHORT = {"`polarguide-stokes`": "ours", "its control": "control", "the control": "control"}
+SHORT["`3dgs-dr:consistent`"] = "dr"
+LIGHT = {"specular": "specular_psnr", "diffuse": "diffuse_psnr", "PSNR": "psnr"}
+
+
+def test_few_photographs():
+    runs = read_json("few-photographs")["runs"]
+    for row in page_table("results/captures", "views, recipe"):
+        views, _, recipe = row["views, recipe"].partition(", ")
+        prefixes = [f"{scene}/{views}/{SHORT[recipe]}" for scene in ("spheres", "cup", "car")]
+        normals = [seeds_of(runs, prefix, "normal_mae_deg") for prefix in prefixes]
+        assert {len(values) for values in normals} == {3}
+        stated = " / ".join(f"{fmean(values):.1f} ± {stdev(values):.1f}" for values in normals)
+        assert row["normal error (deg)"] == stated
+        for heading, key in LIGHT.items():
+            means = [fmean(seeds_of(runs, prefix, key)) for prefix in prefixes]
+            assert row[heading] == " / ".join(f"{mean:.1f}" for mean in means)
+
+
+def test_noise():
+    runs = read_json("few-photographs")["runs"]
+    for row in page_table("results/captures", "noise"):
+        pair = [f"noise/spheres/{row['noise']}/{recipe}" for recipe in ("ours", "control")]
+        for heading, key in (LIGHT | {"normal error (deg)": "normal_mae_deg"}).items():
+            assert row[heading] == " / ".join(f"{fmean(seeds_of(runs, each, key)):.1f}" for each in pair)
+
+
+def test_unknown_angles():
+    searches = read_json("unknown-angles-wwbottle")["searches"]
+    all_unknown, third = page_table("results/captures", "unknown", "pictures")
+    for row, chosen in (
+        (all_unknown, [each for each in searches if each["folds"] == 1]),
+        (third, [each for each in searches if each["folds"] > 1]),
+    ):
+        pictures, error, _, over, doubtful, others, *_ = unknown_angles.summary(chosen)
+        assert [*row.values()][1:] == [pictures, f"{error}°", over, doubtful, f"{others}°"]
+
+
+def test_burning_and_the_worst_view_of_single_shots():
+    runs = {name: run for name, run in read_json("single-shots").items() if not name.startswith("before")}
+    shots = {name: run for name, run in runs.items() if not name.startswith("four")}
+    assert {name.split("-")[1] for name in shots} == {"cup", "car", "kit", "water"}
+    share = max(value for run in shots.values() for key, value in run.items() if key.startswith("burning"))
+    text = " ".join((ROOT / "docs" / "results" / "captures.md").read_text(encoding="utf-8").split())
+    assert f"At most {100 * share:.2f} % of the pixels of a view burn" in text
+    water = [runs["four-water-0"]["worst"] - runs[f"known-water-{seed}"]["worst"] for seed in (0, 1)]
+    assert f"On `water` with known angles, the loss is {max(water):.1f} dB" in text
+
+
+def test_kinds_of_capture():
+    (computed,) = tables_of(capture_kinds.table(read_json("capture-kinds")))
+    assert page_table("how-to/capture", "capture", "files per view") == computed
+
+
+def test_trainings_with_normal_maps():
+    runs = read_json("normal-maps")["runs"]
+    columns = {
+        "PSNR (dB)": ("psnr", 1, 1),
+        "foreground PSNR (dB)": ("psnr_foreground", 1, 1),
+        "normal error (degrees)": ("normal_mae_deg", 1, 1),
+        "depth error (%)": ("depth_error_median_percent", 2, 1),
+        "mesh F-score 1 %": ("mesh_fscore_1", 1, 100),
+    }
+    for row in page_table("how-to/normal-maps", "scene", "PSNR (dB)"):
+        scene = row["scene"].strip("`")
+        for heading, (key, digits, factor) in columns.items():
+            means = [
+                factor * fmean(seeds_of(runs, f"{scene}/{recipe}", key))
+                for recipe in ("3dgs", "3dgs with normal maps")
+            ]
+            assert row[heading] == " → ".join(f"{mean:.{digits}f}" for mean in means)
+
+
+def test_calibration_of_simulated_sensors():
+    recorded = recorded_rows("calibration")
+    for row in page_rows("how-to/calibrate", "shots", "monochrome: DoLP"):
+        assert row in recorded
+    last = (RECORDS / "calibration.md").read_text(encoding="utf-8").splitlines()[-1]
+    factors = last.removeprefix("Calibration divides the errors by ").removesuffix(".")
+    text = " ".join((ROOT / "docs" / "how-to" / "calibrate.md").read_text(encoding="utf-8").split())
+    assert f"by a factor of {factors}" in text
+
+
+def test_alignment_of_half_size_pictures():
+    assert page_rows("reference/formats", "", "DoLP, not registered") == recorded_rows("half-size")
+
+
+def test_normals_from_color():
+    heading, *rows = recorded_rows("optics")
+    recorded = {row[0]: dict(zip(heading, row, strict=True)) for row in rows}
+    one = {
+        "share of the foreground with a normal from color (%)": "color: share of mask decided, percent",
+        "part of this share that is taken for the wrong kind of light (%)": (
+            "color: of those the wrong lobe, percent"
+        ),
+    }
+    pairs = {
+        "error of these normals, mean / median (deg)": "color: normal error",
+        "error of the best of six candidates, mean / median (deg)": "best of six",
+    }
+    for row in page_table("results/ablations", "", "spheres"):
+        label = row.pop("")
+        for scene, cell in row.items():
+            if label in pairs:
+                both = [recorded[f"{pairs[label]}, {kind}"][scene] for kind in ("mean", "median")]
+                assert cell == " / ".join(both)
+            else:
+                assert cell == recorded[one[label]][scene]
+
+
+GPU = {
+    "forward, ms": "forward_ms",
+    "forward and backward, ms": "forward_backward_ms",
+    "training step, ms": "step_ms",
+    "final picture, frames a second": "fps",
+}
+
+
+@pytest.mark.parametrize(("column", "part"), [(1, "demo"), (3, "spheres"), (5, "stress")])
+def test_times_on_a_gpu(column, part):
+    record = read_json("gpu-nvidia-h100-80gb-hbm3")[f"bench-{part}"]
+    rows = {row[0]: row for row in page_rows("explanation/gpu", "", "demo: polarguide")}
+    assert rows["pixels"][column] == " x ".join(map(str, record["size"]))
+    count = f"{record['gaussians']:,}"
+    assert rows["Gaussians"][column] == ("a million" if count == "1,000,000" else count)
+    for place, side in ((column, "ours"), (column + 1, "plain")):
+        for label, key in GPU.items():
+            assert rows[label][place] == f"{float(f'{record[side][key]:.3g}'):g}"
+        assert rows["peak memory, MiB"][place] == f"{record[side]['peak_mib']:.0f}"
