@@ -1,6 +1,6 @@
 """Compare the depth of an exported mesh on test views with the ground truth.
 
-    python benchmarks/accuracy/mesh_depth.py RUN MESH.ply
+    python benchmarks/accuracy/mesh_depth.py RUN MESH.ply > benchmarks/records/mesh-depth.md
 
 Needs trimesh with a ray engine (``pip install embreex``). Errors are in percent of the scene's extent, which is 1.1
 times the largest distance of a camera from the cameras' mean. "rendered" is the blended depth of the Gaussians. A mesh
@@ -62,7 +62,6 @@ def pictures(mesh: trimesh.Trimesh, camera) -> np.ndarray:
 
 
 def main() -> None:
-    """Print the median errors of each test view and of all views."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("run", type=Path)
     parser.add_argument("mesh", type=Path)
@@ -75,7 +74,7 @@ def main() -> None:
     if arguments.picture:
         shown = pictures(mesh, opened.scene.test_views[0].camera)
         cv2.imwrite(str(arguments.picture), cv2.resize(shown, None, fx=2, fy=2)[..., ::-1])
-    errors: dict[str, list[np.ndarray]] = {"mesh": [], "rendered": []}
+    errors: dict[str, list[np.ndarray]] = {"mesh": [], "rendered, alpha blended": []}
     missing = []
     for view in opened.scene.test_views:
         assert view.ground_truth is not None
@@ -84,17 +83,16 @@ def main() -> None:
         rendered = opened.render(view.camera, layers=["depth"])["depth"].cpu()
         rendered = rendered[:: arguments.step, :: arguments.step].numpy()
         ours = mesh_depth(mesh, view.camera, arguments.step)
-        for name, depth in (("mesh", ours), ("rendered", rendered)):
+        for depths, depth in zip(errors.values(), (ours, rendered), strict=True):
             hit = known & np.isfinite(depth)
-            errors[name].append(np.abs(depth - true)[hit] * 100 / extent)
-        missing.append(float((known & np.isnan(ours)).sum() / known.sum()))
-        medians = ", ".join(f"{name} {np.median(values[-1]):.3f} %" for name, values in errors.items())
-        print(f"{view.name}: median {medians}; no mesh on {100 * missing[-1]:.1f} % of the foreground")
-    for name, values in errors.items():
-        joined = np.concatenate(values)
-        print(
-            f"all, {name}: median {np.median(joined):.3f} %, 90th percentile {np.quantile(joined, 0.9):.3f} %"
-        )
+            depths.append(np.abs(depth - true)[hit] * 100 / extent)
+        missing.append(100 * float((known & np.isnan(ours)).sum() / known.sum()))
+    print("| depth | median error | 90th percentile | foreground without a surface |\n|---|---|---|---|")
+    gaps = {"mesh": f"{min(missing):.1f} to {max(missing):.1f} %"}
+    for name, depths in errors.items():
+        joined = np.concatenate(depths)
+        median, large = np.quantile(joined, [0.5, 0.9])
+        print(f"| {name} | {median:.2f} % | {large:.2f} % | {gaps.get(name, '')} |")
 
 
 if __name__ == "__main__":

@@ -112,6 +112,11 @@ def test_calibration_of_simulated_sensors():
     assert f"by a factor of {factors}" in text
 
 
+def test_exported_splats():
+    stated = page_rows("how-to/export", "run of `polarguide-stokes`", "exported splats")
+    assert stated[1:] == recorded_rows("baked-splats")[1:]
+
+
 def test_alignment_of_half_size_pictures():
     assert page_rows("reference/formats", "", "DoLP, not registered") == recorded_rows("half-size")
 
