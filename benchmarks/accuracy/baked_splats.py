@@ -56,7 +56,8 @@ def main() -> None:
         run = open_run(folder)
         baked, diffuse = scores(run)
         print(
-            f"| `{run.scene.root.name}`, {run.steps:,} steps | {baked:.1f} dB | {diffuse:.1f} dB |", flush=True
+            f"| `{run.scene.root.name}`, {run.steps:,} steps | {baked:.1f} dB | {diffuse:.1f} dB |",
+            flush=True,
         )
 
 

@@ -198,13 +198,32 @@ def frame_of(camera: Camera, axes: torch.Tensor) -> dict[str, Any]:
 
 
 @contextmanager
-def engine_page(engine: str, file: Path, modules: Path, folder: Path) -> Iterator[Any]:
-    """Open a page of an engine that has ``show``. The file is served under its name."""
+def browser_page() -> Iterator[Any]:
+    """Open an empty page of a headless Chromium with software WebGL. Its errors and warnings are printed."""
     from playwright.sync_api import sync_playwright
 
     chromium = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
     if chromium is None:
-        sys.exit("skipped: no Chromium")
+        sys.exit("no Chromium -> apt-get install chromium")
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=chromium, args=FLAGS.split())
+        page = browser.new_page()
+        page.set_default_timeout(600_000)
+        page.on("pageerror", lambda error: print("error in the page:", error, file=sys.stderr))
+        page.on("console", report)
+        yield page
+        browser.close()
+
+
+def report(message: Any) -> None:
+    """Print a warning or an error of a page."""
+    if message.type in ("warning", "error"):
+        print("message of the page:", message.text[:200], file=sys.stderr)
+
+
+@contextmanager
+def engine_page(engine: str, file: Path, modules: Path, folder: Path) -> Iterator[Any]:
+    """Open a page of an engine that has ``show``. The file is served under its name."""
     (folder / "node_modules").symlink_to(modules.resolve())
     (folder / "engine.js").write_text(ENGINES[engine])
     (folder / "main.js").write_text(MAIN)
@@ -230,24 +249,11 @@ def engine_page(engine: str, file: Path, modules: Path, folder: Path) -> Iterato
         else:
             route.abort()
 
-    with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=chromium, args=FLAGS.split())
-        page = browser.new_page()
-        page.set_default_timeout(600_000)
-        page.on("pageerror", lambda error: print("error in the page:", error))
-        page.on(
-            "console",
-            lambda said: (
-                print("message of the engine:", said.text[:200])
-                if said.type in ("warning", "error")
-                else None
-            ),
-        )
+    with browser_page() as page:
         page.route("**/*", answer)
         page.goto("http://localhost/")
         page.wait_for_function("window.ready")
         yield page
-        browser.close()
 
 
 def psnr(a: np.ndarray, b: np.ndarray) -> float:

@@ -117,6 +117,10 @@ def test_exported_splats():
     assert stated[1:] == recorded_rows("baked-splats")[1:]
 
 
+def test_shared_pages():
+    assert page_rows("how-to/share", "run", "Gaussians", "file") == recorded_rows("shared-pages")
+
+
 def test_alignment_of_half_size_pictures():
     assert page_rows("reference/formats", "", "DoLP, not registered") == recorded_rows("half-size")
 
