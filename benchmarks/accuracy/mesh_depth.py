@@ -3,7 +3,7 @@
     python benchmarks/accuracy/mesh_depth.py RUN MESH.ply > benchmarks/records/mesh-depth.md
 
 Needs trimesh with a ray engine (``pip install embreex``). Errors are in percent of the scene's extent, which is 1.1
-times the largest distance of a camera from the cameras' mean. "rendered" is the blended depth of the Gaussians. A mesh
+times the largest distance of a camera from the cameras' mean. "rendered" is the depth of the surface that ``polarguide render`` draws. A mesh
 with an up axis or a scale in its file is converted to the scene's axes and units.
 """
 
@@ -74,7 +74,7 @@ def main() -> None:
     if arguments.picture:
         shown = pictures(mesh, opened.scene.test_views[0].camera)
         cv2.imwrite(str(arguments.picture), cv2.resize(shown, None, fx=2, fy=2)[..., ::-1])
-    errors: dict[str, list[np.ndarray]] = {"mesh": [], "rendered, alpha blended": []}
+    errors: dict[str, list[np.ndarray]] = {"mesh": [], "rendered": []}
     missing = []
     for view in opened.scene.test_views:
         assert view.ground_truth is not None

@@ -117,8 +117,36 @@ def test_exported_splats():
     assert stated[1:] == recorded_rows("baked-splats")[1:]
 
 
+def test_depth_of_an_exported_mesh():
+    assert page_rows("how-to/export", "depth", "median error") == recorded_rows("mesh-depth")
+
+
 def test_shared_pages():
     assert page_rows("how-to/share", "run", "Gaussians", "file") == recorded_rows("shared-pages")
+
+
+def test_base_colors():
+    lines = (RECORDS / "base-color.md").read_text(encoding="utf-8").splitlines()
+    recorded = {heading[0]: {row[0]: row[1:] for row in rows} for heading, *rows in row_lists(lines)}
+    heading, *models = page_rows("how-to/textured-model", "`--base-color`", "`kit`")
+    for name, *cells in models:
+        for place, scene in enumerate(heading[1::2]):
+            score, _, factor = recorded[f"model of {scene}"][name]
+            assert cells[2 * place : 2 * place + 2] == [score, factor]
+    heading, scores, roughness = page_rows("how-to/textured-model", "object of `cup`")
+    objects = recorded[heading[0]]
+    assert heading[1:] == [*objects]
+    assert scores[1:] == [objects[name][0] for name in heading[1:]]
+    assert roughness[1:] == [f"{objects[name][1]} ({objects[name][2]})" for name in heading[1:]]
+    pairs = [
+        [float(cell) for cell in row[1:]]
+        for title, table in recorded.items()
+        if title.startswith("object")
+        for row in table.values()
+    ]
+    wrong = sum(abs(found - true) > 0.075 for found, true in pairs)
+    text = (ROOT / "docs" / "how-to" / "textured-model.md").read_text(encoding="utf-8")
+    assert f"wrong by 0.08 or more for {wrong} of {len(pairs)} objects" in text
 
 
 def test_alignment_of_half_size_pictures():
