@@ -1,16 +1,17 @@
 """Check the verdicts of ``polarguide inspect`` on scenes with known faults.
 
-    python benchmarks/accuracy/inspection_verdicts.py SCENE [SCENE ...]
+    python benchmarks/accuracy/inspection_verdicts.py SCENE... > benchmarks/records/inspection.md
 
-Each scene is changed in memory: the eight orders with the same pairs, a zero turned by 10 degrees, gamma-encoded files,
-one angle exposed 5 % longer, and threefold overexposure. The verdicts come from points in several views and from the
-pictures alone, without a training.
+Prints a Markdown table with a column for each scene. Each scene is changed in memory: the eight orders with the same
+pairs, a zero turned by 10 degrees, gamma-encoded files, one angle exposed 5 % longer, and threefold overexposure. The
+verdicts come from points in several views and from the pictures alone, without a training.
 """
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
+import math
 from collections.abc import Callable
 from pathlib import Path
 
@@ -60,18 +61,48 @@ def exposed(place: int) -> Change:
     return lambda values: values * gains
 
 
-def angles_line(capture: Capture, refractive_index: float) -> str:
+def order_and_zero(capture: Capture, refractive_index: float) -> tuple[str, float, float, float]:
+    """Return the verdict on the order of the angles, its probability, and the zero in degrees with its error."""
     pairing = find_pairing(capture) or 0
     evidence, _ = point_evidence(capture.posed, capture.model, refractive_index, pairing)
     angles = combine_evidence([evidence], pairing)
-    order, _, zero = angle_checks(angles)
-    if angles.posterior is None:
-        return f"order {order.verdict}: {evidence.note}"
-    best = ORDERS[angles.posterior.best].files()
-    return (
-        f"order {order.verdict:5} {','.join(map(str, best)):14} p {max(angles.posterior.probabilities):.4f}  "
-        f"zero {zero.verdict:5} {angles.posterior.offset:+.2f} +- {angles.posterior.offset_error:.2f}"
-    )
+    order, *_ = angle_checks(angles)
+    posterior = angles.posterior
+    if posterior is None:
+        return order.verdict, math.nan, math.nan, math.nan
+    return order.verdict, max(posterior.probabilities), posterior.offset, posterior.offset_error
+
+
+def reported(capture: Capture, change: Change, refractive_index: float) -> bool:
+    """Return True if a check of the pictures finds fault with the changed capture."""
+    planted = altered(capture, change)
+    measurements = [measure_view(view, refractive_index) for view in planted.views]
+    found = picture_checks(planted, measurements, find_pairing(planted))
+    return any(check.verdict != "ok" for check in found)
+
+
+def verdicts(path: Path) -> dict[str, str]:
+    """Return the cells of a scene by test."""
+    capture = read_capture(path)
+    refractive_index = capture.refractive_index or 1.5
+    right, *wrong = ORDERS
+    order, probability, zero, error = order_and_zero(capture, refractive_index)
+    others = [order_and_zero(altered(capture, misnamed(each.files())), refractive_index)[0] for each in wrong]
+    _, _, turned_zero, _ = order_and_zero(altered(capture, turned(10.0)), refractive_index)
+    faults = {"gamma": srgb_encode_array, "three times the exposure": lambda values: values * 3}
+    faults |= {f"{ANGLES[k]} degrees exposed 5 % longer": exposed(k) for k in range(4)}
+    assert right.files() == ANGLES
+    return {
+        "right order: verdict, probability": f"{order}, {100 * probability:.1f} %",
+        "wrong orders that are reported, of seven": str(sum(verdict != "ok" for verdict in others)),
+        "estimated zero, degrees (truth 0)": f"{zero:.2f} ± {error:.2f}",
+        "estimated zero, degrees (truth 10)": f"{turned_zero:.2f}",
+        "without a fault": "reported" if reported(capture, lambda values: values, refractive_index) else "ok",
+        **{
+            name: "reported" if reported(capture, change, refractive_index) else "missed"
+            for name, change in faults.items()
+        },
+    }
 
 
 def main() -> None:
@@ -79,33 +110,12 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("scenes", nargs="+", type=Path)
-    parser.add_argument("--pictures-only", action="store_true", help="leave out what takes poses")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
-    for path in arguments.scenes:
-        capture = read_capture(path)
-        refractive_index = capture.refractive_index or 1.5
-        plants: dict[str, Change] = {
-            "untouched": lambda values: values,
-            "gamma": srgb_encode_array,
-            **{f"5 % at {ANGLES[k]}": exposed(k) for k in range(4)},
-            "overexposed x3": lambda values: values * 3,
-        }
-        for name, change in plants.items():
-            planted = altered(capture, change)
-            measurements = [measure_view(view, refractive_index) for view in planted.views]
-            found = picture_checks(planted, measurements, find_pairing(planted))
-            flagged = [f"{check.key} {check.verdict}" for check in found if check.verdict != "ok"]
-            print(f"{path.name:9} {name:15} {', '.join(flagged) or 'all ok'}", flush=True)
-        if arguments.pictures_only:
-            continue
-        for order in ORDERS:
-            line = angles_line(altered(capture, misnamed(order.files())), refractive_index)
-            print(f"{path.name:9} {','.join(map(str, order.files())):15} {line}", flush=True)
-        print(
-            f"{path.name:9} {'zero at 10':15} {angles_line(altered(capture, turned(10.0)), refractive_index)}",
-            flush=True,
-        )
+    columns = [verdicts(path) for path in arguments.scenes]
+    print(f"| test | {' | '.join(path.name for path in arguments.scenes)} |\n|---|{'---|' * len(columns)}")
+    for test in columns[0]:
+        print(f"| {test} | {' | '.join(column[test] for column in columns)} |")
 
 
 if __name__ == "__main__":

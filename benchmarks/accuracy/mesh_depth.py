@@ -3,8 +3,8 @@
     python benchmarks/accuracy/mesh_depth.py RUN MESH.ply > benchmarks/records/mesh-depth.md
 
 Needs trimesh with a ray engine (``pip install embreex``). Errors are in percent of the scene's extent, which is 1.1
-times the largest distance of a camera from the cameras' mean. "rendered" is the depth of the surface that ``polarguide render`` draws. A mesh
-with an up axis or a scale in its file is converted to the scene's axes and units.
+times the largest distance of a camera from the cameras' mean. "rendered" is the depth of the surface that ``polarguide
+render`` draws. A mesh with an up axis or a scale in its file is converted to the scene's axes and units.
 """
 
 from __future__ import annotations

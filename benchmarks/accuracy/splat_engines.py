@@ -2,10 +2,10 @@
 
     npm install three @babylonjs/core @babylonjs/loaders playcanvas @sparkjsdev/spark esbuild     # anywhere
     pip install '.[browser]'                                               # in polarguide's source folder
-    python benchmarks/accuracy/splat_engines.py RUN --node-modules DIR/node_modules --engines three spark
+    python benchmarks/accuracy/splat_engines.py RUN... --node-modules DIR/node_modules > benchmarks/records/engines.md
 
-Prints the PSNR of display pictures for each test view: of the file in the engine, and of the diffuse layer alone. The
-diffuse layer is the upper bound of a file without baked reflections.
+Prints a Markdown table with the mean PSNR of display pictures over the first test views: of the subject in each engine,
+and of the diffuse layer alone. The diffuse layer is the upper bound of a file without baked reflections.
 """
 
 from __future__ import annotations
@@ -17,18 +17,22 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 import cv2
 import numpy as np
 import torch
 
-from polarguide import open_run
+from polarguide import Run, open_run
+from polarguide.capture import View
 from polarguide.geometry.camera import Camera
+from polarguide.results.export.placement import Presented
 from polarguide.visualization import figures
+from polarguide.visualization.figures import Picture
 
 FLAGS = (
     "--headless=new --no-sandbox --use-gl=angle --use-angle=swiftshader --enable-unsafe-swiftshader "
@@ -261,10 +265,52 @@ def psnr(a: np.ndarray, b: np.ndarray) -> float:
     return float(10 * np.log10(255**2 / max(np.mean((a.astype(float) - b) ** 2), 1e-9)))
 
 
+def drawn_by(
+    engine: str, run: Run, path: Path, views: Sequence[View], modules: Path, wait: int
+) -> list[Picture]:
+    """Return the pictures of a file by an engine, from the cameras of views."""
+    upright = path.suffix == ".glb"
+    axes = run.frame.panorama_axes().T if upright else torch.eye(3, dtype=torch.float64)
+    pictures = []
+    with tempfile.TemporaryDirectory() as folder, engine_page(engine, path, modules, Path(folder)) as page:
+        for view in views:
+            frame = {**frame_of(view.camera, axes), "file": path.name}
+            call = "([text, still, wait]) => show(JSON.parse(text), still, wait)"
+            address = page.evaluate(call, [json.dumps(frame), STILL, wait])
+            data = np.frombuffer(base64.b64decode(address.split(",")[1]), np.uint8)
+            pictures.append(np.ascontiguousarray(cv2.imdecode(data, cv2.IMREAD_COLOR)[..., ::-1]))
+    return pictures
+
+
+def row(run: Run, arguments: argparse.Namespace) -> str:
+    """Return the row of a run, and write the pictures if there is a folder for them."""
+    views = run.scene.test_views[: arguments.views]
+    within = Presented(run).subject.holds
+    results = [run.result(view.camera, within=within).to("cpu") for view in views]
+    ours = [figures.radiance_to_rgb(result.final) for result in results]
+    layers = [r.base if r.diffuse is None else r.diffuse for r in results]
+    scores = []
+    for engine in arguments.engines:
+        with tempfile.TemporaryDirectory() as folder:
+            kind, file = FILES[engine]
+            path = arguments.file or Path(folder) / file
+            if not arguments.file:
+                run.export(kind, Path(folder))
+            found = drawn_by(engine, run, path, views, arguments.node_modules, arguments.wait)
+        scores.append(fmean(map(psnr, found, ours)))
+        if arguments.pictures:
+            arguments.pictures.mkdir(parents=True, exist_ok=True)
+            for view, *both in zip(views, found, ours, strict=True):
+                name = f"{run.scene.root.name}_{view.name}_{engine}.png"
+                figures.write_png(arguments.pictures / name, np.concatenate(both, axis=1))
+    alone = fmean(map(psnr, map(figures.radiance_to_rgb, layers), ours))
+    cells = [f"{score:.1f}" for score in (*scores, alone)]
+    return f"| {' | '.join((f'`{run.scene.root.name}`, {run.steps:,} steps', *cells))} |"
+
+
 def main() -> None:
-    """Print a line for each view and engine, and the means."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("run", type=Path)
+    parser.add_argument("runs", type=Path, nargs="+")
     parser.add_argument("--node-modules", type=Path, required=True)
     parser.add_argument(
         "--engines", nargs="+", choices=[*ENGINES], default=["three", "babylon", "playcanvas"]
@@ -276,36 +322,10 @@ def main() -> None:
     parser.add_argument("--wait", type=int, default=400, help="milliseconds between frames")
     parser.add_argument("--pictures", type=Path, help="folder for the engine's pictures and ours")
     arguments = parser.parse_args()
-    opened = open_run(arguments.run)
-    views = opened.scene.test_views[: arguments.views]
-    results = [opened.result(view.camera).to("cpu") for view in views]
-    ours = [figures.radiance_to_rgb(result.final) for result in results]
-    plain = [figures.radiance_to_rgb(r.base if r.diffuse is None else r.diffuse) for r in results]
-    alone = float(np.mean([psnr(*both) for both in zip(plain, ours, strict=True)]))
-    for engine in arguments.engines:
-        with tempfile.TemporaryDirectory() as name:
-            folder = Path(name)
-            kind, file = FILES[engine]
-            path = arguments.file or folder / file
-            if not arguments.file:
-                opened.export(kind, folder)
-            upright = path.suffix == ".glb"
-            axes = opened.frame.panorama_axes().T if upright else torch.eye(3, dtype=torch.float64)
-            scores = []
-            with engine_page(engine, path, arguments.node_modules, folder) as page:
-                for view, expected in zip(views, ours, strict=True):
-                    frame = {**frame_of(view.camera, axes), "file": path.name}
-                    call = "([text, still, wait]) => show(JSON.parse(text), still, wait)"
-                    address = page.evaluate(call, [json.dumps(frame), STILL, arguments.wait])
-                    data = np.frombuffer(base64.b64decode(address.split(",")[1]), np.uint8)
-                    found = np.ascontiguousarray(cv2.imdecode(data, cv2.IMREAD_COLOR)[..., ::-1])
-                    scores.append(psnr(found, expected))
-                    print(f"{view.name}: {path.name} in {engine} {scores[-1]:.2f} dB", flush=True)
-                    if arguments.pictures:
-                        arguments.pictures.mkdir(parents=True, exist_ok=True)
-                        both = np.concatenate((found, expected), axis=1)
-                        figures.write_png(arguments.pictures / f"{view.name}_{engine}.png", both)
-            print(f"mean: {path.name} in {engine} {np.mean(scores):.2f} dB, diffuse layer {alone:.2f} dB")
+    print(f"| run | {' | '.join(arguments.engines)} | diffuse layer alone |")
+    print(f"|---|{'---:|' * (len(arguments.engines) + 1)}")
+    for folder in arguments.runs:
+        print(row(open_run(folder), arguments), flush=True)
 
 
 if __name__ == "__main__":
