@@ -125,6 +125,16 @@ def test_shared_pages():
     assert page_rows("how-to/share", "run", "Gaussians", "file") == recorded_rows("shared-pages")
 
 
+def test_verdicts_of_inspection():
+    recorded = recorded_rows("inspection")
+    stated = page_rows("explanation/angle-order", "test", "spheres")
+    assert [row for row in stated if row not in recorded] == []
+    faults = [
+        row[1:] for row in recorded if row[0].endswith("longer") or "gamma" in row[0] or "times" in row[0]
+    ]
+    assert faults == [["reported"] * 4] * 6
+
+
 def test_base_colors():
     lines = (RECORDS / "base-color.md").read_text(encoding="utf-8").splitlines()
     recorded = {heading[0]: {row[0]: row[1:] for row in rows} for heading, *rows in row_lists(lines)}
