@@ -58,6 +58,7 @@ def assert_equal_tables(stated, computed, names):
 @pytest.mark.parametrize(
     ("page", "headings", "folder", "scenes", "layers"),
     [
+        ("../index", ("method", "PSNR"), "", ("front",), LAYERS),
         ("index", ("recipe, eleven scenes",), "bench", (*DEVELOPMENT, *HELD_BACK), WITHOUT_METALS),
         ("index", ("recipe, four scenes",), "four", FOUR, LAYERS),
         ("index", ("recipe, three seeds",), "final/four", FOUR, LAYERS),
