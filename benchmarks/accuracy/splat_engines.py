@@ -26,6 +26,7 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
+from PIL import Image
 
 from polarguide import Run, open_run
 from polarguide.capture import View
@@ -159,6 +160,7 @@ FILES = {
     "spark": ("ply", "splats.ply"),
 }
 """Export format and file of each engine. ``--file`` replaces it."""
+TITLES = {"three": "three.js", "babylon": "Babylon", "playcanvas": "PlayCanvas", "spark": "Spark"}
 MAIN = """
 import start from "./engine.js";
 const canvas = document.querySelector("canvas");
@@ -282,14 +284,15 @@ def drawn_by(
     return pictures
 
 
-def row(run: Run, arguments: argparse.Namespace) -> str:
-    """Return the row of a run, and write the pictures if there is a folder for them."""
+def compared(run: Run, arguments: argparse.Namespace) -> tuple[str, list[Picture]]:
+    """Return the row of a run in the table, and pictures of the first view: ours, then those of the engines."""
     views = run.scene.test_views[: arguments.views]
     within = Presented(run).subject.holds
     results = [run.result(view.camera, within=within).to("cpu") for view in views]
     ours = [figures.radiance_to_rgb(result.final) for result in results]
     layers = [r.base if r.diffuse is None else r.diffuse for r in results]
     scores = []
+    shown = ours[:1]
     for engine in arguments.engines:
         with tempfile.TemporaryDirectory() as folder:
             kind, file = FILES[engine]
@@ -298,14 +301,10 @@ def row(run: Run, arguments: argparse.Namespace) -> str:
                 run.export(kind, Path(folder))
             found = drawn_by(engine, run, path, views, arguments.node_modules, arguments.wait)
         scores.append(fmean(map(psnr, found, ours)))
-        if arguments.pictures:
-            arguments.pictures.mkdir(parents=True, exist_ok=True)
-            for view, *both in zip(views, found, ours, strict=True):
-                name = f"{run.scene.root.name}_{view.name}_{engine}.png"
-                figures.write_png(arguments.pictures / name, np.concatenate(both, axis=1))
+        shown.append(found[0])
     alone = fmean(map(psnr, map(figures.radiance_to_rgb, layers), ours))
     cells = [f"{score:.1f}" for score in (*scores, alone)]
-    return f"| {' | '.join((f'`{run.scene.root.name}`, {run.steps:,} steps', *cells))} |"
+    return f"| {' | '.join((f'`{run.scene.root.name}`', *cells))} |", shown
 
 
 def main() -> None:
@@ -320,12 +319,19 @@ def main() -> None:
     )
     parser.add_argument("--views", type=int, default=3)
     parser.add_argument("--wait", type=int, default=400, help="milliseconds between frames")
-    parser.add_argument("--pictures", type=Path, help="folder for the engine's pictures and ours")
+    parser.add_argument("--figure", type=Path, help="JPEG to write: a row of pictures for each run")
     arguments = parser.parse_args()
-    print(f"| run | {' | '.join(arguments.engines)} | diffuse layer alone |")
+    titles = [TITLES[engine] for engine in arguments.engines]
+    print(f"| run of `polarguide-stokes` | {' | '.join(titles)} | diffuse layer alone |")
     print(f"|---|{'---:|' * (len(arguments.engines) + 1)}")
+    rows = []
     for folder in arguments.runs:
-        print(row(open_run(folder), arguments), flush=True)
+        row, pictures = compared(open_run(folder), arguments)
+        print(row, flush=True)
+        rows.append(pictures)
+    if arguments.figure:
+        sheet = figures.contact_sheet(rows, [""] * len(rows), ["polarguide", *titles], minimum_width=1)
+        Image.fromarray(sheet).save(arguments.figure, quality=88)
 
 
 if __name__ == "__main__":

@@ -117,6 +117,11 @@ def test_exported_splats():
     assert stated[1:] == recorded_rows("baked-splats")[1:]
 
 
+def test_splats_in_other_engines():
+    stated = page_rows("how-to/export", "run of `polarguide-stokes`", "three.js")
+    assert stated == recorded_rows("engines")
+
+
 def test_depth_of_an_exported_mesh():
     assert page_rows("how-to/export", "depth", "median error") == recorded_rows("mesh-depth")
 
