@@ -94,7 +94,7 @@ def verdicts(path: Path) -> dict[str, str]:
     assert right.files() == ANGLES
     return {
         "right order: verdict, probability": f"{order}, {100 * probability:.1f} %",
-        "wrong orders that are reported, of seven": str(sum(verdict != "ok" for verdict in others)),
+        "wrong orders that are reported, of seven": str(sum(verdict == "wrong" for verdict in others)),
         "estimated zero, degrees (truth 0)": f"{zero:.2f} ± {error:.2f}",
         "estimated zero, degrees (truth 10)": f"{turned_zero:.2f}",
         "without a fault": "reported" if reported(capture, lambda values: values, refractive_index) else "ok",

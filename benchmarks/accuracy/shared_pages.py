@@ -10,15 +10,12 @@ its brightness.
 
 from __future__ import annotations
 
-import base64
 import sys
 import time
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-import cv2
-import numpy as np
-from splat_engines import browser_page, psnr
+from splat_engines import browser_page, decoded, psnr
 
 import polarguide as pg
 from polarguide.results.export.placement import Presented
@@ -37,10 +34,7 @@ def pictures_of_page(path: Path, view: str) -> tuple[dict[str, Picture], float]:
         layers = [layer for layer in page.evaluate("polarguide.scene.layers") if layer in LAYERS]
         gloss = page.evaluate("polarguide.scene.gloss")
         addresses = page.evaluate("([v, l]) => polarguide.pictures(v, l)", [view, layers])
-    pictures = {}
-    for layer, address in zip(layers, addresses, strict=True):
-        data = np.frombuffer(base64.b64decode(address.split(",")[1]), np.uint8)
-        pictures[layer] = np.ascontiguousarray(cv2.imdecode(data, cv2.IMREAD_COLOR)[..., ::-1])
+    pictures = {layer: decoded(address) for layer, address in zip(layers, addresses, strict=True)}
     return pictures, gloss
 
 

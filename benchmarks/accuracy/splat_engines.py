@@ -279,9 +279,14 @@ def drawn_by(
             frame = {**frame_of(view.camera, axes), "file": path.name}
             call = "([text, still, wait]) => show(JSON.parse(text), still, wait)"
             address = page.evaluate(call, [json.dumps(frame), STILL, wait])
-            data = np.frombuffer(base64.b64decode(address.split(",")[1]), np.uint8)
-            pictures.append(np.ascontiguousarray(cv2.imdecode(data, cv2.IMREAD_COLOR)[..., ::-1]))
+            pictures.append(decoded(address))
     return pictures
+
+
+def decoded(address: str) -> Picture:
+    """Return the picture of a data URL with a PNG file."""
+    data = np.frombuffer(base64.b64decode(address.split(",")[1]), np.uint8)
+    return np.ascontiguousarray(cv2.imdecode(data, cv2.IMREAD_COLOR)[..., ::-1])
 
 
 def compared(run: Run, arguments: argparse.Namespace) -> tuple[str, list[Picture]]:

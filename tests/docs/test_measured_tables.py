@@ -29,8 +29,13 @@ def seeds_of(runs, prefix, key):
     return [run[key] for name, run in runs.items() if name.rpartition("/")[0] == prefix]
 
 
-SHORT = {"`polarguide-stokes`": "ours", "its control": "control", "the control": "control"}
-SHORT["`3dgs-dr:consistent`"] = "dr"
+SHORT = {
+    "`polarguide-stokes`": "ours",
+    "its control": "control",
+    "the control": "control",
+    "`3dgs-dr:consistent`": "dr",
+}
+"""Recipes in the keys of few-photographs.json, by their names on the page."""
 LIGHT = {"specular": "specular_psnr", "diffuse": "diffuse_psnr", "PSNR": "psnr"}
 
 
