@@ -69,7 +69,8 @@ def test_every_public_name_is_there() -> None:
     assert {"polarguide-stokes", "polarguide:only-normals"} <= set(polarguide.recipes())
     for name in polarguide.__all__:
         assert getattr(polarguide, name) is not None
-    assert (Path(polarguide.__file__).parent / "py.typed").exists()
+    for package in ("polarguide", "polarguide_shots", "polarguide_bench", "polarguide_synth"):
+        assert (Path(polarguide.__file__).parents[1] / package / "py.typed").exists()
     with pytest.raises(AttributeError, match="nothing"):
         _ = polarguide.nothing
 

@@ -117,6 +117,15 @@ def test_calibration_of_simulated_sensors():
     assert f"by a factor of {factors}" in text
 
 
+@pytest.mark.parametrize(
+    ("number", "headings"),
+    [(0, ("scene and source of the gains", "median error")), (1, ("scene", "registered of"))],
+)
+def test_gains_and_poses_of_single_shots(number, headings):
+    lines = (RECORDS / "filter-shots.md").read_text(encoding="utf-8").splitlines()
+    assert page_rows("reference/formats", *headings) == row_lists(lines)[number]
+
+
 def test_exported_splats():
     stated = page_rows("how-to/export", "run of `polarguide-stokes`", "exported splats")
     assert stated[1:] == recorded_rows("baked-splats")[1:]
