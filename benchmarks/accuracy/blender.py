@@ -1,15 +1,15 @@
 """Compare exported models in Blender (Cycles, on the CPU) from held-out cameras with the photographs.
 
     python3.11 -m venv ENV && ENV/bin/pip install bpy==5.0.1          # 1 GB, in its own environment
-    python benchmarks/accuracy/blender.py RUN MODEL.glb [MODEL.usdz ...] --bpy ENV/bin/python [--room SCENE]
+    python benchmarks/accuracy/blender.py RUN MODEL.glb ... --bpy ENV/bin/python --room SCENE > blender.md
 
-The models are exports of RUN in the scene's own units. The run's exported environment lights them. With --room, the
-environment of another scene lights them, and its pictures are the reference. ``polarguide synth`` must have rendered
-that scene with the same objects and cameras in another room.
+The models are exports of RUN in the scene's own units. They are lit by the run's exported environment, and then by the
+environment of another scene. ``polarguide synth`` must have rendered that scene with the same objects and cameras in
+another room; its pictures are the reference in the other room.
 
 PSNR is of sRGB values in the mask of the foreground, without a factor and with the best factor of the light for all
-views, because the brightness is ambiguous. Files with "unlit" in their names are drawn without light. "not black"
-covers dielectrics with an albedo above 0.05, with their own best factor.
+views, because the brightness is ambiguous. Files with "unlit" in their names are drawn without light, and only in the
+first room. "not black" covers dielectrics with an albedo above 0.05, with their own best factor.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from polarguide.capture.formats.pictures import read_radiance
 from polarguide.geometry.camera import Camera
 from polarguide.optics.color import srgb_encode_array
 from polarguide.results.rendering.relight import write_exr
-from polarguide.runs.opened import read_scene
+from polarguide.runs.opened import OpenedRun, read_scene
 from polarguide.visualization import figures
 
 HEIGHT = 512
@@ -102,53 +102,90 @@ def drawn(
     return [read_radiance(folder / f"{name}.exr")[..., :3] for name in frames]
 
 
+class Room:
+    """Light, cameras and photographs of held-out views.
+
+    Args:
+        run: the run whose models are drawn.
+        lit: scene that has the light and the photographs, or None for the run's own.
+        count: number of views.
+        folder: empty folder for the environment and the files of Blender.
+    """
+
+    def __init__(self, run: OpenedRun, lit: Path | None, count: int, folder: Path) -> None:
+        self.folder = folder
+        axes = run.frame.panorama_axes().numpy()
+        if lit is None:
+            run.export("environment", folder)
+        else:
+            write_exr(folder / "environment.exr", room_light(lit, axes))
+        scene = run.scene if lit is None else read_scene(lit)
+        views = [scene.view(view.name) for view in run.scene.test_views[:count]]
+        self.cameras = [view.camera for view in views]
+        self.frames = {view.name: frame_of(view.camera, axes) for view in views}
+        self.photographs = [view.photograph().numpy() for view in views]
+        self.masks = []
+        self.bodies = []
+        for view in views:
+            with np.load(run.scene.root / "gt" / f"{view.name}.npz") as truth:
+                mask = truth["mask"] > 0
+                self.masks.append(mask)
+                self.bodies.append(mask & (truth["metalness"] == 0) & (truth["albedo"].mean(-1) > BLACK))
+
+    def cells(self, pictures: list[np.ndarray]) -> list[str]:
+        """Return PSNR, PSNR with the best factor, this factor, and PSNR of bodies that are not black."""
+        inside, colored = (chosen(pictures, self.photographs, part) for part in (self.masks, self.bodies))
+        best, factor = best_factor(*inside)
+        return [f"{psnr(*inside):.1f}", f"{best:.1f}", f"{factor:.2f}", f"{best_factor(*colored)[0]:.1f}"]
+
+
 def main() -> None:
     """Print a table of all models, and of our own pictures in the light of the run."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("run", type=Path)
     parser.add_argument("models", type=Path, nargs="+")
     parser.add_argument("--bpy", type=Path, required=True, help="a Python that has bpy")
-    parser.add_argument("--room", type=Path, help="a scene with the same things and cameras in another light")
+    parser.add_argument(
+        "--room", type=Path, required=True, help="a scene with the same objects and cameras in another light"
+    )
     parser.add_argument("--views", type=int, default=4)
     parser.add_argument("--samples", type=int, default=48)
-    parser.add_argument("--pictures", type=Path, help="folder for Blender's pictures beside the photographs")
+    parser.add_argument("--sheet", type=Path, help="picture of the models in both rooms beside a photograph")
+    parser.add_argument("--shown", type=int, default=1, help="number of the view of the sheet")
     arguments = parser.parse_args()
     run = open_run(arguments.run)
-    axes = run.frame.panorama_axes().numpy()
-    scene = read_scene(arguments.room) if arguments.room else run.scene
-    views = [scene.view(view.name) for view in run.scene.test_views[: arguments.views]]
-    photographs = [view.photograph().numpy() for view in views]
-    masks, bodies = [], []
-    for view in views:
-        with np.load(run.scene.root / "gt" / f"{view.name}.npz") as truth:
-            masks.append(truth["mask"] > 0)
-            bodies.append(masks[-1] & (truth["metalness"] == 0) & (truth["albedo"].mean(axis=-1) > BLACK))
-
-    def scored(label: str, pictures: list[np.ndarray]) -> None:
-        inside, colored = (chosen(pictures, photographs, part) for part in (masks, bodies))
-        best, factor = best_factor(*inside)
-        scores = f"{psnr(*inside):9.2f} {best:9.2f} {factor:7.2f} {best_factor(*colored)[0]:9.2f}"
-        print(f"{label:32} {scores}", flush=True)
-
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        if arguments.room:
-            write_exr(folder / "environment.exr", room_light(arguments.room, axes))
-        else:
-            run.export("environment", folder)
-        frames = {view.name: frame_of(view.camera, axes) for view in views}
-        print(f"{'model':32} {'factor 1':>9} {'best':>9} {'factor':>7} {'not black':>9}")
+    columns = ["best factor", "that factor", "not black"]
+    print(f"| model | learned light | {' | '.join(columns)} | another room | {' | '.join(columns)} |")
+    print(f"|---{2 * (1 + len(columns)) * '|---'}|")
+    with tempfile.TemporaryDirectory() as own, tempfile.TemporaryDirectory() as other:
+        rooms = {
+            "learned": Room(run, None, arguments.views, Path(own)),
+            "other": Room(run, arguments.room, arguments.views, Path(other)),
+        }
+        shown: dict[str, dict[str, np.ndarray]] = {name: {} for name in rooms}
         for path in arguments.models:
-            found = drawn(path, folder, frames, arguments)
-            label = f"{path.parent.name}/{path.name}"
-            scored(label, found)
-            if arguments.pictures:
-                arguments.pictures.mkdir(parents=True, exist_ok=True)
-                rows = [np.concatenate(pair, axis=1) for pair in zip(found, photographs, strict=True)]
-                picture = figures.radiance_to_rgb(torch.from_numpy(np.concatenate(rows)).float())
-                figures.write_png(arguments.pictures / f"{label.replace('/', '_')}.png", picture)
-        if not arguments.room:
-            scored("our own pictures", [run.result(v.camera).to("cpu").final.numpy() for v in views])
+            row = [f"`{path.stem}`"]
+            for name, room in rooms.items():
+                if name == "other" and "unlit" in path.stem:
+                    row.extend([""] * (1 + len(columns)))
+                    continue
+                pictures = drawn(path, room.folder, room.frames, arguments)
+                row.extend(room.cells(pictures))
+                if "unlit" not in path.stem:
+                    shown[name][path.stem] = pictures[arguments.shown]
+            print(f"| {' | '.join(row)} |", flush=True)
+        room = rooms["learned"]
+        ours = [run.result(camera).to("cpu").final.numpy() for camera in room.cameras]
+        print(f"| {' | '.join(['polarguide', *room.cells(ours)] + [''] * (1 + len(columns)))} |")
+    if arguments.sheet:
+        for name, room in rooms.items():
+            shown[name]["photograph"] = room.photographs[arguments.shown]
+        tiles = [
+            [figures.radiance_to_rgb(torch.from_numpy(p).float()) for p in row.values()]
+            for row in shown.values()
+        ]
+        sheet = figures.contact_sheet(tiles, ["", ""], list(shown["learned"]))
+        figures.write_png(arguments.sheet, sheet)
 
 
 if __name__ == "__main__":

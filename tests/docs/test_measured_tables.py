@@ -140,6 +140,10 @@ def test_depth_of_an_exported_mesh():
     assert page_rows("how-to/export", "depth", "median error") == recorded_rows("mesh-depth")
 
 
+def test_models_in_blender():
+    assert page_rows("how-to/textured-model", "model", "learned light") == recorded_rows("blender")
+
+
 def test_shared_pages():
     assert page_rows("how-to/share", "run", "Gaussians", "file") == recorded_rows("shared-pages")
 
