@@ -144,6 +144,10 @@ def test_models_in_blender():
     assert page_rows("how-to/textured-model", "model", "learned light") == recorded_rows("blender")
 
 
+def test_times_of_measure():
+    assert page_rows("how-to/inspection-line", "`--demosaic`", "whole picture") == recorded_rows("measuring")
+
+
 def test_shared_pages():
     assert page_rows("how-to/share", "run", "Gaussians", "file") == recorded_rows("shared-pages")
 
