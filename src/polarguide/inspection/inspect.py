@@ -21,6 +21,7 @@ from torch.nn.functional import max_pool2d
 from polarguide import __version__, optics
 from polarguide.capture import Scene, load_scene
 from polarguide.capture.angle_evidence import OrderEvidence, posterior
+from polarguide.capture.colmap.sfm import SAMPLE, log_false_alarms
 from polarguide.capture.layout import refuse_scene
 from polarguide.capture.view import listed
 from polarguide.core.errors import require
@@ -291,10 +292,10 @@ class PoseLimits:
     Attributes:
         neighbors: number of views that each view is matched with.
         features: largest number of features of a view.
-        fewest_matches: smallest number of matches for a comparison of two views.
         ratio: largest ratio of the descriptor distance of a match to that of the second best match.
-        gate: largest distance of a match from its epipolar line, as a share of the picture's diagonal. More distant
-            matches count as mismatches.
+        accuracy_px: largest distance of a true match from its epipolar line, in pixels of the inspected picture.
+        false_alarm: probability that a capture has a pair of views whose chance matches are judged.
+        fewest_pairs: smallest number of pairs that judge a view. One pair does not tell which of its views is wrong.
         typical_px: median epipolar error in stored pixels above which a capture gets a warning.
         view_px: median epipolar error in stored pixels above which a single view may get a warning.
         stands_out: smallest ratio of a bad view's error to that of the median view.
@@ -306,9 +307,10 @@ class PoseLimits:
 
     neighbors = 4
     features = 3000
-    fewest_matches = 15
     ratio = 0.75
-    gate = 0.02
+    accuracy_px = 2.0
+    false_alarm = 0.01
+    fewest_pairs = 2
     typical_px = 2.0
     view_px = 2.0
     stands_out = 2.5
@@ -320,7 +322,13 @@ class PoseLimits:
 
 @dataclass(frozen=True)
 class PairError:
-    """Epipolar error of two views: median distance of their matches from the epipolar lines, in stored pixels."""
+    """Epipolar error of two views.
+
+    Attributes:
+        first, second: names of the views.
+        matches: number of true matches.
+        error: median distance of the true matches from their epipolar lines, in stored pixels.
+    """
 
     first: str
     second: str
@@ -331,23 +339,27 @@ class PairError:
 def epipolar_errors(capture: Capture) -> list[PairError]:
     """Match each view that has a pose with the views that are nearest in position and viewing direction."""
     views = [(view.name, camera, *_features(view)) for view, camera in capture.cameras]
-    errors = (
-        _pair_error(views[i], views[j], capture.factor)
-        for i, j in _neighbor_pairs([camera for _, camera in capture.cameras])
-    )
+    pairs = _neighbor_pairs([camera for _, camera in capture.cameras])
+    limit = math.log(PoseLimits.false_alarm / max(1, len(pairs)))
+    errors = (_pair_error(views[i], views[j], capture.factor, limit) for i, j in pairs)
     return [error for error in errors if error is not None]
 
 
 def view_errors(errors: Sequence[PairError]) -> dict[str, float]:
     """Return the error of each view, which is the lower quartile over its pairs.
 
-    The lower quartile is not affected by a single bad neighbor.
+    The lower quartile is not affected by a single bad neighbor. Views with fewer than ``fewest_pairs`` pairs are left
+    out.
     """
     by_view: dict[str, list[float]] = {}
     for pair in errors:
         for name in (pair.first, pair.second):
             by_view.setdefault(name, []).append(pair.error)
-    return {name: float(np.quantile(values, 0.25)) for name, values in sorted(by_view.items())}
+    return {
+        name: float(np.quantile(values, 0.25))
+        for name, values in sorted(by_view.items())
+        if len(values) >= PoseLimits.fewest_pairs
+    }
 
 
 def _features(view: InspectedView) -> tuple[NDArray[np.float64], NDArray[np.float32] | None]:
@@ -377,7 +389,17 @@ _Features = tuple[str, Camera, NDArray[np.float64], NDArray[np.float32] | None]
 """Type of the features of a view: its name, its camera, their positions [N, 2], and their descriptors [N, 128]."""
 
 
-def _pair_error(first: _Features, second: _Features, factor: int) -> PairError | None:
+def _pair_error(first: _Features, second: _Features, factor: int, limit: float) -> PairError | None:
+    """Return the epipolar error of two views, or None if they have too few true matches.
+
+    Matches are true if they agree on any epipolar geometry and if this agreement is no chance. The geometry of the
+    poses does not matter, so that wrong poses do not hide themselves.
+
+    Args:
+        first, second: features of the views.
+        factor: stored pixels per inspected pixel.
+        limit: largest logarithm of the number of false alarms.
+    """
     name1, camera1, x1, d1 = first
     name2, camera2, x2, d2 = second
     if d1 is None or d2 is None or min(len(d1), len(d2)) < 2:
@@ -389,21 +411,28 @@ def _pair_error(first: _Features, second: _Features, factor: int) -> PairError |
         for m, n in matcher.knnMatch(d1, d2, k=2)
         if m.distance < PoseLimits.ratio * n.distance and backward.get(m.trainIdx) == m.queryIdx
     ]
-    if len(matches) < PoseLimits.fewest_matches:
+    if len(matches) <= SAMPLE:
         return None
-    p1 = np.concatenate([x1[[m.queryIdx for m in matches]], np.ones((len(matches), 1))], axis=1)
-    p2 = np.concatenate([x2[[m.trainIdx for m in matches]], np.ones((len(matches), 1))], axis=1)
+    places1 = x1[[m.queryIdx for m in matches]]
+    places2 = x2[[m.trainIdx for m in matches]]
+    accuracy = PoseLimits.accuracy_px
+    _, inliers = cv2.findFundamentalMat(places1, places2, cv2.FM_RANSAC, accuracy, 0.9999, 5000)
+    if inliers is None:
+        return None
+    true = inliers[:, 0] > 0
+    share = 2 * accuracy * math.hypot(camera2.width, camera2.height) / (camera2.width * camera2.height)
+    if log_false_alarms(len(matches), int(true.sum()), share) > limit:
+        return None
+    p1 = np.pad(places1[true], ((0, 0), (0, 1)), constant_values=1)
+    p2 = np.pad(places2[true], ((0, 0), (0, 1)), constant_values=1)
     matrix = _fundamental(camera1, camera2)
     along2 = p1 @ matrix.T
     along1 = p2 @ matrix
     value = np.abs((p2 * along2).sum(axis=1))
     length = np.sqrt((along1[:, :2] ** 2).sum(1) + (along2[:, :2] ** 2).sum(1))
-    infinite = np.full_like(value, np.inf)  # cameras at one place have no epipolar lines
-    distance = np.divide(value, length, out=infinite, where=length > 0) * np.sqrt(2)
-    near = distance < PoseLimits.gate * float(np.hypot(camera1.width, camera1.height))
-    if near.sum() < PoseLimits.fewest_matches:
+    if (length == 0).any():  # cameras at one place have no epipolar lines
         return None
-    return PairError(name1, name2, int(near.sum()), float(np.median(distance[near])) * factor)
+    return PairError(name1, name2, int(true.sum()), float(np.median(np.sqrt(2) * value / length)) * factor)
 
 
 def _fundamental(first: Camera, second: Camera) -> NDArray[np.float64]:
@@ -424,7 +453,8 @@ def pose_check(capture: Capture) -> Check:
     errors = view_errors(epipolar_errors(capture))
     if len(errors) < 3:
         finding = "Too few features match between neighboring views to judge the poses."
-        finding += f" {len(missing)} views have none."
+        if missing:
+            finding += f" {len(missing)} views have no pose."
         remedy = "Structure from motion needs static texture." if missing else ""
         figures: dict[str, Any] = {"views": {}, "without_pose": len(missing)}
         return Check("poses", "warning" if missing else "n/a", finding, remedy, missing, figures)
@@ -433,6 +463,11 @@ def pose_check(capture: Capture) -> Check:
         name for name, e in errors.items() if e > max(PoseLimits.view_px, PoseLimits.stands_out * typical)
     )
     finding = f"Matches lie {typical:.2f} px from their epipolar lines (median view of {len(errors)})."
+    unchecked = [view.name for view in capture.posed if view.name not in errors]
+    if unchecked:
+        finding += (
+            f" Too few matches to check {len(unchecked)} of {len(capture.posed)} views: {listed(unchecked)}."
+        )
     verdict: Verdict = "warning" if bad or missing else "ok"
     remedies = []
     if bad:
