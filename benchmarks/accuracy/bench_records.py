@@ -9,6 +9,7 @@ from typing import Any
 
 import msgspec
 
+from polarguide.core.errors import require
 from polarguide.results.evaluation.table import METRICS
 from polarguide_bench.results import read_results
 
@@ -56,7 +57,7 @@ def read_scenes(paths: Sequence[Path]) -> dict[str, dict[str, dict[int, Any]]]:
     """Return the finished runs of all records by scene, recipe and seed, in the order of the records.
 
     Raises:
-        PolarguideError: a file is not a record.
+        PolarguideError: a file is not a record, or two records have the same run.
     """
     scenes: dict[str, dict[str, dict[int, Any]]] = {}
     for path in paths:
@@ -64,8 +65,15 @@ def read_scenes(paths: Sequence[Path]) -> dict[str, dict[str, dict[int, Any]]]:
         for recipe in record["recipes"]:
             for run in record["runs"]:
                 if run["recipe"] == recipe["name"] and run["state"] == "done":
-                    rows = scenes.setdefault(run["scene"], {})
-                    rows.setdefault(run["recipe"], {})[run["seed"]] = run
+                    seeds = scenes.setdefault(run["scene"], {}).setdefault(run["recipe"], {})
+                    require(
+                        run["seed"] not in seeds,
+                        path,
+                        expected="runs that no other record has",
+                        found=f"{run['scene']}, {run['recipe']}, seed {run['seed']} for the second time",
+                        remedy="Print tables of different sets of scenes one by one.",
+                    )
+                    seeds[run["seed"]] = run
     return scenes
 
 

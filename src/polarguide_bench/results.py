@@ -221,16 +221,20 @@ LEAST_UNITS = 3
 """Minimum number of seeds, views or scenes for a confidence interval. With two, the interval is uselessly wide."""
 NORMAL_QUANTILE = float(stats.norm.ppf((1 + CONFIDENCE) / 2))
 KNOWN_SCATTER: Mapping[str, float] = {
-    "psnr": 0.23,
-    "psnr_foreground": 0.113,
-    "psnr_reflective": 0.143,
-    "ssim": 0.00126,
-    "normal_mae_deg": 0.46,
-    "normal_within_11": 0.0093,
-    "specular_psnr": 0.28,
-    "diffuse_psnr": 0.28,
-    "specular_psnr_aligned": 0.28,
-    "diffuse_psnr_aligned": 0.28,
+    "psnr": 0.21,
+    "psnr_seen": 0.26,
+    "psnr_foreground": 0.11,
+    "psnr_reflective": 0.14,
+    "ssim": 0.0014,
+    "flip": 0.0018,
+    "normal_mae_deg": 0.33,
+    "normal_within_11": 0.0043,
+    "specular_psnr": 0.15,
+    "diffuse_psnr": 0.31,
+    "specular_psnr_aligned": 0.16,
+    "diffuse_psnr_aligned": 0.33,
+    "stokes_error": 0.011,
+    "mesh_fscore_1": 0.0028,
 }
 """Standard deviation over seeds of the difference between two recipes at the same seed on one scene, by metric.
 

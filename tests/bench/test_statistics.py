@@ -1,9 +1,8 @@
 """Paired differences, their intervals and what is noise: against scipy, by simulation, and the docs' page on them."""
 
-import itertools
-import json
 import random
 import re
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from comparison_records import results, run, unfinished
+from markdown_tables import page_table, tables_of
 from scipy import stats
 
 from polarguide_bench.results import (
@@ -32,12 +32,11 @@ FREE, LOOSE = "r:unpolarized", "r:unpolarized-without-consistency"
 T_95 = {2: 4.302653, 3: 3.182446, 5: 2.570582}
 """Student's quantiles at 97.5 %, from a printed table, by degrees of freedom."""
 ROOT = Path(__file__).parents[2]
+sys.path.append(str(ROOT / "benchmarks" / "accuracy"))
+import seed_scatter  # noqa: E402
+
 PAGE = ROOT / "docs" / "explanation" / "statistics.md"
-RECORDS = ("ablation-polarguide", "ablation-polarguide-stokes")
-AUDITED = {"psnr": 0.23, "psnr_foreground": 0.10, "normal_mae_deg": 0.46} | dict.fromkeys(
-    ("specular_psnr", "diffuse_psnr", "specular_psnr_aligned", "diffuse_psnr_aligned"), 0.28
-)
-"""Upper ends of what the page quotes beside the records."""
+PAGE_NAME = "explanation/statistics"
 
 
 def trained(scene: str, recipe: str, seed: int, views: dict[str, float], key: str = "psnr") -> dict[str, Any]:
@@ -287,28 +286,44 @@ def test_a_mean_over_scenes_scatters_less() -> None:
     assert bold == {**dict.fromkeys("abcd", 0), "mean over scenes": 1}  # 1.96 times 0.23 / 2 is 0.23
 
 
-def test_the_known_scatter_is_that_of_the_records_on_file() -> None:
-    scatters: dict[str, list[float]] = {}
-    for name in RECORDS:
-        record = json.loads((ROOT / "benchmarks" / "results" / f"{name}.json").read_text())
-        scores = {(r["scene"], r["recipe"], r["seed"]): r["metrics"] for r in record["runs"]}
-        scenes, recipes = ([item["name"] for item in record[key]] for key in ("scenes", "recipes"))
-        for scene, (a, b), key in itertools.product(
-            scenes, itertools.combinations(recipes, 2), KNOWN_SCATTER
-        ):
-            pairs = [(scores[scene, a, seed][key], scores[scene, b, seed][key]) for seed in range(3)]
-            if None not in itertools.chain(*pairs):
-                scatters.setdefault(key, []).append(float(np.std([x - y for x, y in pairs], ddof=1)))
-    median_of_sample = np.sqrt(stats.chi2(2).median() / 2)  # of a standard deviation of three, which is 1
-    for key, known in KNOWN_SCATTER.items():
-        recorded = float(np.median(scatters[key]) / median_of_sample)
-        assert known == pytest.approx(max(recorded, AUDITED.get(key, 0.0)), rel=0.02), key
+def test_the_known_scatter_and_the_page_agree_with_the_records() -> None:
+    pairs = seed_scatter.pairs_of_records(sorted((ROOT / "benchmarks" / "results" / "final").glob("*/*.json")))
+    recorded, by_metric = tables_of(seed_scatter.scatter_table(pairs)), {}
+    stated, pairing = page_table(PAGE_NAME, "metric", "unit"), page_table(PAGE_NAME, "remaining variance (%)")
+    assert [[stated], [pairing]] == [recorded, tables_of(seed_scatter.pairing_table(pairs))]
+    assert f"{len(pairs)} pairs" in PAGE.read_text(encoding="utf-8")
+    by_metric = {row["metric"].strip("`"): float(row["scatter"]) for row in stated}
+    assert by_metric == KNOWN_SCATTER
 
 
-def test_the_page_gives_the_known_scatter_and_the_power_of_seeds() -> None:
+def test_the_scatter_of_simulated_pairs() -> None:
+    rng = np.random.default_rng(8)
+    difficulty = rng.normal(0, 3, 40)
+    pairs = []
+    for _ in range(400):
+        luck = rng.normal(0, 0.4, 3)  # shared by both recipes
+        own = rng.normal(0, 0.2, (2, 3))
+        both = [
+            {
+                seed: {
+                    "metrics": {"psnr": 30 + luck[seed] + own[recipe, seed]},
+                    "views": {
+                        view: {"psnr": 30 + hard + rng.normal(0, 0.5)} for view, hard in enumerate(difficulty)
+                    },
+                }
+                for seed in range(3)
+            }
+            for recipe in range(2)
+        ]
+        pairs.append(("scene", *both))
+    assert np.median(seed_scatter.scatters(pairs, "psnr")) == pytest.approx(0.2 * 2**0.5, rel=0.1)
+    assert seed_scatter.left_by_seeds(pairs, "psnr") == pytest.approx(0.04 / (0.04 + 0.16), rel=0.1)
+    by_view = [share for pair in pairs for share in seed_scatter.left_by_views(pair, "psnr")]
+    assert np.median(by_view) == pytest.approx(0.25 / (0.25 + difficulty.var(ddof=1)), rel=0.1)
+
+
+def test_the_page_gives_the_power_of_seeds() -> None:
     text = PAGE.read_text(encoding="utf-8")
-    for key, known in KNOWN_SCATTER.items():
-        assert re.search(rf"\| `{key}`[^|]*\|[^|]*\| {known:g} \|", text), key
     rows = re.findall(r"^\| (\d\.?\d*) \| (\d+) \|$", text, re.MULTILINE)
     assert len(rows) >= 5
     for ratio, seeds in rows:
