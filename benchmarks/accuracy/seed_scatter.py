@@ -2,8 +2,8 @@
 
     python benchmarks/accuracy/seed_scatter.py benchmarks/results/final/*/*.json
 
-A pair consists of a recipe and one of its controls, which have at least three common seeds on a scene. The tables are in
-docs/explanation/statistics.md, which explains them, and KNOWN_SCATTER of polarguide_bench has the values.
+A pair consists of a recipe and one of its controls, which have at least three common seeds on a scene. The tables are
+in docs/explanation/statistics.md, which explains them, and KNOWN_SCATTER of polarguide_bench has the values.
 """
 
 from __future__ import annotations
