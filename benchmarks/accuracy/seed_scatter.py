@@ -17,10 +17,9 @@ from pathlib import Path
 from typing import Any
 
 from bench_records import BY_KEY, Scenes, Seeds, of_run, read_scenes, values
-from scipy import stats
 
 from polarguide.core.errors import PolarguideError, require
-from polarguide_bench.results import KNOWN_SCATTER, LEAST_UNITS, controlled
+from polarguide_bench.results import KNOWN_SCATTER, LEAST_UNITS, NORMAL_QUANTILE, controlled
 
 PAIRED = ("psnr", "psnr_foreground", "normal_mae_deg", "specular_psnr", "diffuse_psnr")
 """Metrics of the table of pairing."""
@@ -55,15 +54,28 @@ def differences(pair: Pair, key: str) -> list[float]:
     return [ours[seed] - theirs[seed] for seed in sorted(ours.keys() & theirs.keys())]
 
 
-def unbiased(deviation: float, count: int) -> float:
-    """Correct the bias of a median of sample standard deviations, each of ``count`` normally distributed values."""
-    return deviation / math.sqrt(stats.chi2(count - 1).median() / (count - 1))
-
-
 def scatters(pairs: Iterable[Pair], key: str) -> list[float]:
-    """Return the scatter of a metric for each pair that has the metric."""
+    """Return the standard deviation over seeds of the differences, for each pair that has the metric."""
     found = (differences(pair, key) for pair in pairs)
-    return [unbiased(statistics.stdev(d), len(d)) for d in found if len(d) >= LEAST_UNITS]
+    return [statistics.stdev(d) for d in found if len(d) >= LEAST_UNITS]
+
+
+def typical_scatter(pairs: Iterable[Pair], key: str) -> float:
+    """Return the scatter of a metric: the root of the mean variance over all pairs."""
+    return math.sqrt(statistics.fmean(scatter**2 for scatter in scatters(pairs, key)))
+
+
+def beyond(pairs: Iterable[Pair], key: str, scatter: float) -> float:
+    """Return the share of single differences that a test with this scatter would wrongly mark.
+
+    These are farther from the mean of their pair than ``NORMAL_QUANTILE`` scatters. Deviations from a mean of few
+    values are smaller than those from the true mean. They are enlarged accordingly.
+    """
+    found = [d for pair in pairs if len(d := differences(pair, key)) >= LEAST_UNITS]
+    deviations = [
+        (value - statistics.fmean(d)) * math.sqrt(len(d) / (len(d) - 1)) for d in found for value in d
+    ]
+    return statistics.fmean(abs(deviation) > NORMAL_QUANTILE * scatter for deviation in deviations)
 
 
 def left_by_views(pair: Pair, key: str) -> Iterator[float]:
@@ -94,15 +106,21 @@ def left_by_seeds(pairs: Iterable[Pair], key: str) -> float:
     return paired / alone
 
 
+def rounded(value: float) -> float:
+    """Return a number with two significant digits."""
+    return float(f"{value:.2g}")
+
+
 def scatter_table(pairs: Sequence[Pair]) -> Iterator[str]:
-    """Yield a table of the scatter of each metric: the median over all pairs, and the range over pairs."""
-    yield "| metric | unit | scatter | smallest | largest |"
-    yield "|---|---|---:|---:|---:|"
+    """Yield a table of the scatter of each metric, of its range over pairs, and of the differences beyond it."""
+    yield "| metric | unit | scatter | smallest | largest | wrongly marked (%) |"
+    yield "|---|---|---:|---:|---:|---:|"
     for key in KNOWN_SCATTER:
+        scatter = rounded(typical_scatter(pairs, key))
         found = scatters(pairs, key)
-        cells = (f"{float(f'{value:.2g}'):g}" for value in (statistics.median(found), min(found), max(found)))
+        cells = (f"{value:g}" for value in (scatter, rounded(min(found)), rounded(max(found))))
         unit = BY_KEY[key].unit if BY_KEY[key].factor == 1 else "share"
-        yield f"| `{key}` | {unit} | {' | '.join(cells)} |"
+        yield f"| `{key}` | {unit} | {' | '.join(cells)} | {100 * beyond(pairs, key, scatter):.0f} |"
 
 
 def pairing_table(pairs: Sequence[Pair]) -> Iterator[str]:

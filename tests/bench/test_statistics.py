@@ -283,7 +283,10 @@ def test_a_mean_over_scenes_scatters_less() -> None:
     runs = [run(s, r, 0, psnr=v) for s in "abcd" for r, v in (("best", 31.0), ("near", 30.7))]
     blocks = dict(scores_section(results(runs)).blocks)
     bold = {title: sum(cells[0][2] for _, cells in rows) for title, rows in blocks.items()}
-    assert bold == {**dict.fromkeys("abcd", 0), "mean over scenes": 1}  # 1.96 times 0.23 / 2 is 0.23
+    assert bold == {
+        **dict.fromkeys("abcd", 0),
+        "mean over scenes": 1,
+    }  # below 1.96 times the scatter, but above half of it
 
 
 def test_the_known_scatter_and_the_page_agree_with_the_records() -> None:
@@ -317,7 +320,9 @@ def test_the_scatter_of_simulated_pairs() -> None:
             for recipe in range(2)
         ]
         pairs.append(("scene", *both))
-    assert np.median(seed_scatter.scatters(pairs, "psnr")) == pytest.approx(0.2 * 2**0.5, rel=0.1)
+    scatter = seed_scatter.typical_scatter(pairs, "psnr")
+    assert scatter == pytest.approx(0.2 * 2**0.5, rel=0.1)
+    assert seed_scatter.beyond(pairs, "psnr", scatter) == pytest.approx(0.05, abs=0.015)
     assert seed_scatter.left_by_seeds(pairs, "psnr") == pytest.approx(0.04 / (0.04 + 0.16), rel=0.1)
     by_view = [share for pair in pairs for share in seed_scatter.left_by_views(pair, "psnr")]
     assert np.median(by_view) == pytest.approx(0.25 / (0.25 + difficulty.var(ddof=1)), rel=0.1)

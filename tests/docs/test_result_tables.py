@@ -118,6 +118,12 @@ def test_losses_of_four_scenes():
     assert [[*row.values()] for row in stated] == [[*row.values()] for row in by_method]
 
 
+def test_sets_with_scenes_of_one_name_are_refused():
+    paths = [RECORDS / "final" / part / "cup.json" for part in ("four", "bench")]
+    with pytest.raises(PolarguideError, match=r"bench/cup\.json.*cup, 3dgs, seed 0 for the second time"):
+        read_scenes(paths)
+
+
 def test_an_unknown_recipe_is_refused():
     scenes = scenes_of("bench", ["cup"])
     bench_tables.check_recipes(scenes, ["3dgs", "ref-gs"])
