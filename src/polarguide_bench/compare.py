@@ -422,7 +422,6 @@ def collect(
                 digest=scene.digest,
                 views=scene.views,
                 test_views=list(scene.test_views),
-                black_share=scene.black_share,
                 warnings=list(scene.warnings) or UNSET,
                 refractive_index=UNSET
                 if settings.refractive_index is not None

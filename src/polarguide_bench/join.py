@@ -25,6 +25,7 @@ from polarguide_bench.recipes import recipe_named
 from polarguide_bench.report import REPORT, report_html
 from polarguide_bench.results import (
     FORMAT,
+    KNOWN_SCATTER,
     Provenance,
     RecipeRecord,
     Record,
@@ -33,7 +34,6 @@ from polarguide_bench.results import (
     SceneRecord,
     metric_of_runs,
     read_results,
-    scatter_on,
     values_of,
 )
 from polarguide_bench.tables import (
@@ -193,7 +193,7 @@ def _measured_row(results: Results, scene: str, metric: Metric, columns: Mapping
     rows = {i: row for name in columns.values() for i, row in enumerate(all_rows) if row.recipe == name}
     values = values_of(results.record, metric_of_runs(metric.key), [scene])
     means = {i: mean for i, row in rows.items() if (mean := row.cells[metric.key].mean) is not None}
-    bold = leaders(means, values, metric, scatter_on(results.record, values, metric))
+    bold = leaders(means, values, metric, KNOWN_SCATTER.get(metric.key))
     cells = [score_cell(row, metric, i in bold, results) for i, row in rows.items()]
     return [(_label(metric), False, "")], cells
 

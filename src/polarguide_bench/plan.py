@@ -20,9 +20,8 @@ import torch
 from safetensors import SafetensorError, safe_open
 
 from polarguide import __version__
-from polarguide.capture import View
 from polarguide.capture.layout import SHARE
-from polarguide.capture.variants import black_pixels, mask_background
+from polarguide.capture.variants import mask_background
 from polarguide.core.errors import PolarguideError, require
 from polarguide.core.options import DeviceName, Exposures, SceneOptions, index_of
 from polarguide.core.progress import SILENT, Reporter
@@ -145,7 +144,6 @@ class SceneEntry:
         digest: SHA-256 of the files of the scene.
         views: number of views.
         test_views: names of the test views.
-        black_share: share of black pixels in the first test view.
         warnings: sentences about scores that are limited because ground truth is missing.
         refractive_index: refractive index in ``scene.json``, or None if it contains none.
     """
@@ -155,7 +153,6 @@ class SceneEntry:
     digest: str
     views: int
     test_views: tuple[str, ...]
-    black_share: float | None = None
     warnings: tuple[str, ...] = ()
     refractive_index: float | None = None
 
@@ -269,17 +266,11 @@ def scene_entries(comparison: Comparison, reporter: Reporter = SILENT) -> list[S
                 scene.digest,
                 len(scene.views),
                 scene.test_names,
-                black_share(scene.test_views[0]),
                 warnings,
                 scene.refractive_index,
             )
         )
     return entries
-
-
-def black_share(view: View) -> float:
-    """Return the share of black pixels in a view."""
-    return float(black_pixels(view).float().mean())
 
 
 def plan_runs(comparison: Comparison, scenes: Sequence[SceneEntry]) -> list[PlannedRun]:

@@ -88,7 +88,6 @@ class SceneRecord(msgspec.Struct):
         digest: digest of the files of the scene.
         views: number of views.
         test_views: names of the test views, over which scores are averaged.
-        black_share: share of black pixels in the first test view, if known.
         warnings: sentences about scores that are limited because ground truth is missing. The field is absent without
             warnings.
         refractive_index: refractive index of the scene's runs. The field is present only if ``Settings`` contains None.
@@ -98,7 +97,6 @@ class SceneRecord(msgspec.Struct):
     digest: str
     views: Count
     test_views: list[str]
-    black_share: Annotated[float, Meta(ge=0, le=1)] | None = None
     warnings: list[str] | UnsetType = UNSET
     refractive_index: Annotated[float, Meta(gt=1, lt=4)] | UnsetType = UNSET
 
@@ -221,28 +219,24 @@ LEAST_UNITS = 3
 """Minimum number of seeds, views or scenes for a confidence interval. With two, the interval is uselessly wide."""
 NORMAL_QUANTILE = float(stats.norm.ppf((1 + CONFIDENCE) / 2))
 KNOWN_SCATTER: Mapping[str, float] = {
-    "psnr": 0.24,
-    "psnr_seen": 0.41,
-    "psnr_foreground": 0.16,
-    "psnr_reflective": 0.18,
-    "ssim": 0.0018,
+    "psnr": 0.23,
+    "psnr_seen": 0.39,
+    "psnr_foreground": 0.15,
+    "psnr_reflective": 0.19,
+    "ssim": 0.0017,
     "flip": 0.0015,
-    "normal_mae_deg": 0.44,
-    "normal_within_11": 0.0092,
-    "specular_psnr": 0.54,
-    "diffuse_psnr": 0.78,
-    "specular_psnr_aligned": 0.55,
-    "diffuse_psnr_aligned": 0.73,
+    "normal_mae_deg": 0.42,
+    "normal_within_11": 0.0088,
+    "specular_psnr": 0.51,
+    "diffuse_psnr": 0.74,
+    "specular_psnr_aligned": 0.52,
+    "diffuse_psnr_aligned": 0.69,
     "stokes_error": 0.013,
-    "mesh_fscore_1": 0.012,
+    "mesh_fscore_1": 0.011,
 }
 """Standard deviation over seeds of the difference between two recipes at the same seed on one scene, by metric.
 
 ``docs/explanation/statistics.md`` describes its origin."""
-KNOWN_SCATTER_ON_BLACK: Mapping[str, float] = {**KNOWN_SCATTER, "psnr": 1.5}
-"""Known scatter for pictures with a black background. Faint haze, which depends on the seed, dominates their error."""
-BLACK_SHARE = 0.25
-"""Share of black pixels above which a picture has a black background."""
 CONTROL = "unpolarized"
 """Name of the variation without polarization, which is the control of a recipe ``R``.
 
@@ -256,15 +250,6 @@ def controlled(recipes: Sequence[str]) -> dict[str, list[str]]:
         for recipe in recipes
     }
     return {recipe: controls for recipe, controls in by_recipe.items() if controls}
-
-
-def known_scatter(key: str, black_share: float | None) -> float | None:
-    """Return the known scatter of a metric on a scene, which depends on the scene's share of black pixels.
-
-    If the share is unknown, it is assumed to be small.
-    """
-    black = black_share is not None and black_share >= BLACK_SHARE
-    return (KNOWN_SCATTER_ON_BLACK if black else KNOWN_SCATTER).get(key)
 
 
 def values_of(
@@ -348,7 +333,7 @@ def t_half_width(values: Sequence[float]) -> float:
     return quantile * (stdev(values) / math.sqrt(len(values)))
 
 
-def estimate(differences: Sequence[Numbers], scatter: Sequence[float | None]) -> dict[str, Any]:
+def estimate(differences: Sequence[Numbers], scatter: float | None) -> dict[str, Any]:
     """Return the mean of paired differences with its confidence interval and noise.
 
     With at least three scenes, the interval describes the variation between scenes. With fewer scenes, it describes the
@@ -358,7 +343,7 @@ def estimate(differences: Sequence[Numbers], scatter: Sequence[float | None]) ->
 
     Args:
         differences: result of ``paired`` for each scene, not empty.
-        scatter: known scatter on each scene.
+        scatter: known scatter of the metric, or None.
 
     Returns:
         A dictionary with these keys. ``mean`` is the mean difference. ``low`` and ``high`` are the ends of the 95 %
@@ -386,12 +371,12 @@ def estimate(differences: Sequence[Numbers], scatter: Sequence[float | None]) ->
     }
 
 
-def training_noise(by_seed: Numbers, scatter: Sequence[float | None]) -> float | None:
+def training_noise(by_seed: Numbers, scatter: float | None) -> float | None:
     """Return the largest mean difference between two equally good recipes that random seeds can cause.
 
     Args:
         by_seed: differences [scenes, seeds], NaN for a seed without a pair. Each scene has at least one pair.
-        scatter: known scatter on each scene.
+        scatter: known scatter of the metric, or None.
 
     Returns:
         Half the width of the 95 % confidence interval over seeds. If all scenes share at least three seeds, it is
@@ -400,13 +385,13 @@ def training_noise(by_seed: Numbers, scatter: Sequence[float | None]) -> float |
     values = _means_by_seed(by_seed)
     if len(values) >= LEAST_UNITS:
         return t_half_width(values)
-    if None in scatter:
+    if scatter is None:
         return None
-    variances = [(s or 0.0) ** 2 / len(known(row)) for s, row in zip(scatter, by_seed, strict=True)]
+    variances = [scatter**2 / len(known(row)) for row in by_seed]
     return NORMAL_QUANTILE * math.sqrt(math.fsum(variances)) / len(by_seed)
 
 
-def is_noise(by_seed: Numbers, scatter: Sequence[float | None]) -> bool | None:
+def is_noise(by_seed: Numbers, scatter: float | None) -> bool | None:
     """Return True if a difference is at most ``training_noise``, or None if that noise is unknown."""
     half = training_noise(by_seed, scatter)
     return None if half is None else abs(fmean(fmean(known(row)) for row in by_seed)) <= half
@@ -450,31 +435,24 @@ def pair(
         sign = 1 if column.better == "higher" else -1
         levels = [fmean([x for v in common for x in known(v[1 + k])]) * sign for k in range(len(complete))]
         chosen = complete[levels.index(max(levels))]
-    scatters = scatter_on(record, values, column) if scatter else [None] * len(values)
+    known_scatter = KNOWN_SCATTER.get(column.key) if scatter else None
     left_out = [o for o in others if o not in complete]
-    return {"other": chosen, **estimate(pairs[chosen], scatters), "left_out": left_out}
+    return {"other": chosen, **estimate(pairs[chosen], known_scatter), "left_out": left_out}
 
 
-def scatter_on(record: Record, scenes: Iterable[str], column: Metric) -> list[float | None]:
-    """Return the known scatter of a metric on each scene."""
-    black = {scene.name: scene.black_share for scene in record.scenes}
-    return [known_scatter(column.key, black[scene]) for scene in scenes]
-
-
-def told_apart(
-    values: Values, best: int, other: int, sign: float, scatter: Sequence[float | None]
-) -> bool | None:
-    """Return True if one recipe is better than another by more than noise.
+def told_apart(values: Values, best: int, other: int, column: Metric, scatter: float | None) -> bool | None:
+    """Return True if one recipe is better than another by more than noise in a metric with a better direction.
 
     The test uses the seeds that both recipes have on each scene. Return None if no test is possible. This is the case
     without paired seeds, or if they are too few and the known scatter is missing.
     """
-    present = {scene: v for scene, v in values.items() if not np.isnan(v[[best, other]]).all()}
-    leads = [sign * paired(v[best], v[other]) for v in present.values()]
+    sign = 1.0 if column.better == "higher" else -1.0
+    present = [v for v in values.values() if not np.isnan(v[[best, other]]).all()]
+    leads = [sign * paired(v[best], v[other]) for v in present]
     if not leads or not all(lead.size for lead in leads):
         return None
     by_seed = seed_means(leads)
-    half = training_noise(by_seed, [s for s, scene in zip(scatter, values, strict=True) if scene in present])
+    half = training_noise(by_seed, scatter)
     return None if half is None else fmean(fmean(known(row)) for row in by_seed) > half
 
 

@@ -27,6 +27,7 @@ from polarguide.results.evaluation.table import (
 )
 from polarguide.visualization.pages import templates
 from polarguide_bench.results import (
+    KNOWN_SCATTER,
     Results,
     RunRecord,
     ScoreRow,
@@ -35,7 +36,6 @@ from polarguide_bench.results import (
     known,
     metric_of_runs,
     pair,
-    scatter_on,
     seed_means,
     told_apart,
     values_of,
@@ -129,7 +129,7 @@ def scores_section(results: Results) -> Section:
         for column in columns:
             means = {i: m for i, row in enumerate(rows) if (m := row.cells[column.key].mean) is not None}
             of = {s: v for s, v in values[column.key].items() if scene in (None, s)}
-            bold[column.key] = leaders(means, of, column, scatter_on(results.record, of, column))
+            bold[column.key] = leaders(means, of, column, KNOWN_SCATTER.get(column.key))
         parts = [
             (
                 [(row.recipe, True, _remark(row, results))],
@@ -141,9 +141,7 @@ def scores_section(results: Results) -> Section:
     return Section("scores", "", ("recipe",), [c.heading for c in columns], blocks, notes(results))
 
 
-def leaders(
-    means: Mapping[int, float], values: Values, column: Metric, scatter: Sequence[float | None]
-) -> set[int]:
+def leaders(means: Mapping[int, float], values: Values, column: Metric, scatter: float | None) -> set[int]:
     """Return the recipes with the best mean of a metric, and all recipes that are not significantly worse.
 
     The test compares differences at the same seeds with ``training_noise``. The set is empty if no recipe is
@@ -153,13 +151,13 @@ def leaders(
         means: displayed values by index of the recipe.
         values: values of all runs.
         column: the metric.
-        scatter: known scatter on each scene of the values.
+        scatter: known scatter of these values, or None.
     """
     if column.better is None or len(means) < 2:
         return set()
     sign = 1.0 if column.better == "higher" else -1.0
     best = max(means, key=lambda index: sign * means[index])
-    apart = {index: told_apart(values, best, index, sign, scatter) for index in means if index != best}
+    apart = {index: told_apart(values, best, index, column, scatter) for index in means if index != best}
     if True not in apart.values():
         return set()
     digits = formatted(means[best], column)
@@ -413,7 +411,7 @@ def _means(values: Values, column: Metric) -> list[TableCell]:
         for index, of in enumerate(recipes)
         if all(known(seeds) for seeds in of)
     }
-    bold = leaders(means, values, column, [None] * len(values))
+    bold = leaders(means, values, column, None)
     return [(formatted(means.get(index), column), "", index in bold) for index in range(len(recipes))]
 
 

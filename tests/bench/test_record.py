@@ -45,7 +45,6 @@ def test_what_is_written_passes(tmp_path: Path) -> None:
         (("recipes", 0, "data"), [], "recipes[0].data", "a JSON object {...}"),
         (("runs", 0, "seed"), -1, "runs[0].seed", "0 or more"),
         (("scenes", 0, "views"), -6, "scenes[0].views", "0 or more"),
-        (("scenes", 0, "black_share"), -5.0, "scenes[0].black_share", "0 to 1"),
         (("runs", 0, "objects", "o"), PART | {"pixels": -1}, "runs[0].objects.o.pixels", "0 or more"),
         (("runs", 0, "materials", "m"), PART | {"views": -1}, "runs[0].materials.m.views", "0 or more"),
         (("runs", 0, "scene"), "z", "runs[0].scene", "one of x, y"),
@@ -90,13 +89,12 @@ def test_stored_results_are_read_and_shown(path: Path) -> None:
 
 def test_a_record_without_later_fields_is_completed(tmp_path: Path) -> None:
     former = two()
-    del former["settings"]["against"], former["scenes"][0]["black_share"]
+    del former["settings"]["against"]
     for item in former["runs"]:
         del item["objects"], item["materials"], item["metrics"]["ssim"]
     (tmp_path / "results.json").write_text(json.dumps(former))
     read = read_results(tmp_path / "results.json")
     assert (read.settings.against, read.runs[0].objects) == (None, {})
-    assert [scene.black_share for scene in read.scenes] == [None, 0.0]
     assert not any("SSIM" in heading for heading in scores_section(Results(read)).headings)
 
 

@@ -141,7 +141,7 @@ def bench() -> Results:
             materials = {scores["material"]: scores for scores in parts.values()}
             runs.append(made | {"views": views, "objects": parts, "materials": materials})
     runs[-1] = unfinished("ceramic", FREE[1], 0, "disk full")
-    return results(runs, against="3dgs-dr", black=("ceramic",))
+    return results(runs, against="3dgs-dr")
 
 
 def test_every_section_is_on_the_page_and_in_the_browser(tmp_path: Path) -> None:

@@ -19,7 +19,6 @@ from polarguide_bench.results import (
     controlled,
     estimate,
     is_noise,
-    known_scatter,
     paired,
     shared,
     t_half_width,
@@ -72,7 +71,7 @@ def test_the_unit_is_the_scene_else_the_seed_else_the_view(
     scenes: int, seeds: int, over: str | None, count: int
 ) -> None:
     values = np.random.default_rng(scenes).normal(1, 3, (scenes, seeds, 6))
-    found = estimate(list(values), [None] * scenes)
+    found = estimate(list(values), None)
     assert (found["over"], found["count"], found["seeds"]) == (over, count, seeds)
     assert found["mean"] == pytest.approx(values.mean())
     axes = {"scenes": (1, 2), "seeds": (0, 2), "views": (0, 1)}
@@ -102,7 +101,7 @@ def test_intervals_over_seeds_hold_the_truth_as_often_as_they_say() -> None:
         # A training's luck moves all of its views; each view has its own difficulty, which pairing takes out.
         d = truth + rng.normal(0, 0.2, (3, 1)) + rng.normal(0, 0.3, (3, 6))
         for over, values in (("seeds", d), ("views", d[:1])):
-            found = estimate([values], [None])
+            found = estimate([values], None)
             assert found["over"] == over
             hits[over] += found["low"] <= truth <= found["high"]
     assert 0.93 < hits["seeds"] / trials < 0.97
@@ -112,15 +111,14 @@ def test_intervals_over_seeds_hold_the_truth_as_often_as_they_say() -> None:
 def test_noise_is_that_of_three_seeds_else_the_known_scatter() -> None:
     values = np.random.default_rng(0).normal(0.1, 0.2, 4)
     half = stats.ttest_1samp(values, 0).confidence_interval().high - values.mean()
-    assert training_noise(values[None], [99.0]) == pytest.approx(half)
-    assert training_noise(np.array([[1.0]]), [0.2]) == pytest.approx(1.959964 * 0.2)
-    assert training_noise(np.array([[1.0, 5.0]]), [0.2]) == pytest.approx(1.959964 * 0.2 / 2**0.5)
+    assert training_noise(values[None], 99.0) == pytest.approx(half)
+    assert training_noise(np.array([[1.0]]), 0.2) == pytest.approx(1.959964 * 0.2)
+    assert training_noise(np.array([[1.0, 5.0]]), 0.2) == pytest.approx(1.959964 * 0.2 / 2**0.5)
     # Two scenes, of one and two seeds: the variance of the mean of their means.
-    two = training_noise(np.array([[1.0, NAN], [1.0, 2.0]]), [0.2, 0.4])
-    assert two == pytest.approx(1.959964 * (0.2**2 / 4 + 0.4**2 / 2 / 4) ** 0.5)
-    assert training_noise(np.array([[1.0, 2.0]]), [None]) is None
-    assert training_noise(np.array([[1.0], [1.0]]), [0.2, None]) is None
-    assert is_noise(np.array([[1.0]]), [None]) is None
+    two = training_noise(np.array([[1.0, NAN], [1.0, 2.0]]), 0.2)
+    assert two == pytest.approx(1.959964 * (0.2**2 / 4 + 0.2**2 / 2 / 4) ** 0.5)
+    assert training_noise(np.array([[1.0, 2.0]]), None) is None
+    assert is_noise(np.array([[1.0]]), None) is None
 
 
 def test_controls_are_known_by_their_names() -> None:
@@ -222,10 +220,10 @@ def test_differences_are_to_a_recipe_that_was_asked_for_and_of_no_seconds_or_cou
     assert results(runs).differences.empty
 
 
-def leading(key: str, table: dict[str, dict[int, float]], black: tuple[str, ...] = ()) -> set[str]:
+def leading(key: str, table: dict[str, dict[int, float]]) -> set[str]:
     """Return the leading recipes of a column from values by recipe and seed on one scene."""
     runs = [run("cup", recipe, seed, **{key: v}) for recipe, by in table.items() for seed, v in by.items()]
-    ((_, rows),) = scores_section(results(runs, black=black)).blocks
+    ((_, rows),) = scores_section(results(runs)).blocks
     return {labels[0][0] for labels, cells in rows if cells[0][2]}
 
 
@@ -233,13 +231,11 @@ LUCK = (0.0, 2.0, 4.0)
 
 
 @pytest.mark.parametrize(
-    ("key", "table", "black", "best"),
+    ("key", "table", "best"),
     [
         # Rows within noise of the best share its mark: 1.96 times 0.23 is 0.45.
-        ("psnr", {"best": {0: 31.0}, "near": {0: 30.6}, "far": {0: 30.5}}, False, {"best", "near"}),
-        # On black a seed moves the picture by 1.5 dB, and not the foreground.
-        ("psnr", {"best": {0: 31.0}, "near": {0: 30.6}, "far": {0: 30.5}}, True, set()),
-        ("psnr_foreground", {"best": {0: 31.0}, "near": {0: 30.6}}, True, {"best"}),
+        ("psnr", {"best": {0: 31.0}, "near": {0: 30.6}, "far": {0: 30.5}}, {"best", "near"}),
+        ("psnr_foreground", {"best": {0: 31.0}, "near": {0: 30.6}}, {"best"}),
         # Pairing tells what spreads would not: always behind, and as far behind, but not always.
         (
             "psnr",
@@ -248,16 +244,15 @@ LUCK = (0.0, 2.0, 4.0)
                 "behind": {s: 29.7 + x + 0.01 * s for s, x in enumerate(LUCK)},
                 "wild": {s: 29.7 + x for s, x in enumerate((4.0, 0.0, 2.0))},
             },
-            False,
             {"best", "wild"},
         ),
         # Rows of unequal seeds are paired where they meet, and not at all without a common one.
-        ("psnr", {"best": {0: 30.0, 1: 33.0, 2: 33.0}, "one": {0: 30.0}}, False, set()),
-        ("psnr", {"best": {0: 30.0, 1: 33.0, 2: 33.0}, "one": {0: 29.0}}, False, {"best"}),
-        ("psnr", {"best": {0: 30.0, 1: 33.0, 2: 33.0}, "apart": {9: 31.9}}, False, set()),
+        ("psnr", {"best": {0: 30.0, 1: 33.0, 2: 33.0}, "one": {0: 30.0}}, set()),
+        ("psnr", {"best": {0: 30.0, 1: 33.0, 2: 33.0}, "one": {0: 29.0}}, {"best"}),
+        ("psnr", {"best": {0: 30.0, 1: 33.0, 2: 33.0}, "apart": {9: 31.9}}, set()),
         # With an unknown scatter, fewer than three seeds decide nothing, however far apart they are.
-        ("lpips", {"a": {0: 0.100}, "b": {0: 0.102}, "c": {0: 0.1001}}, False, set()),
-        ("lpips", {"a": {0: 0.2, 1: 0.2}, "b": {0: 0.4, 1: 0.6}, "c": {0: 0.3, 1: 0.3}}, False, set()),
+        ("lpips", {"a": {0: 0.100}, "b": {0: 0.102}, "c": {0: 0.1001}}, set()),
+        ("lpips", {"a": {0: 0.2, 1: 0.2}, "b": {0: 0.4, 1: 0.6}, "c": {0: 0.3, 1: 0.3}}, set()),
         (
             "lpips",
             {
@@ -265,21 +260,17 @@ LUCK = (0.0, 2.0, 4.0)
                 "b": {0: 0.1, 1: 0.4, 2: 0.5},
                 "c": {0: 0.3, 1: 0.31, 2: 0.3},
             },
-            False,
             {"a", "b"},
         ),
-        ("psnr", {"a": {0: 30.0}}, False, set()),  # nothing to be better than
-        ("gaussians", {"a": {0: 1.0}, "b": {0: 2.0}}, False, set()),  # neither is better
+        ("psnr", {"a": {0: 30.0}}, set()),  # nothing to be better than
+        ("gaussians", {"a": {0: 1.0}, "b": {0: 2.0}}, set()),  # neither is better
     ],
 )
-def test_the_best_are_marked(
-    key: str, table: dict[str, dict[int, float]], black: bool, best: set[str]
-) -> None:
-    assert leading(key, table, ("cup",) if black else ()) == best
+def test_the_best_are_marked(key: str, table: dict[str, dict[int, float]], best: set[str]) -> None:
+    assert leading(key, table) == best
 
 
 def test_a_mean_over_scenes_scatters_less() -> None:
-    assert known_scatter("psnr", None) == KNOWN_SCATTER["psnr"]
     runs = [run(s, r, 0, psnr=v) for s in "abcd" for r, v in (("best", 31.0), ("near", 30.7))]
     blocks = dict(scores_section(results(runs)).blocks)
     bold = {title: sum(cells[0][2] for _, cells in rows) for title, rows in blocks.items()}

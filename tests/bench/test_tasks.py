@@ -8,10 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import torch
 from heard import Heard
 
-from polarguide.capture import Scene
 from polarguide.core.options import ComputeOptions, SceneOptions
 from polarguide.methods import recipe_named
 from polarguide.results.evaluation.evaluate import evaluate
@@ -26,7 +24,6 @@ from polarguide_bench.plan import (
     Comparison,
     PlannedRun,
     SceneEntry,
-    black_share,
     plan_runs,
     scene_entries,
 )
@@ -97,13 +94,12 @@ def test_seconds_count_only_alone(planned: Planned, trained: Path) -> None:
     assert (run.metrics["train_seconds"], run.metrics["fps"], run.error) == (None, 60.0, None)
 
 
-def test_objects_materials_and_black_pixels_are_collected(planned: Planned, trained: Path) -> None:
+def test_objects_and_materials_are_collected(planned: Planned, trained: Path) -> None:
     question, scenes, only = planned
     shutil.copytree(trained, only.folder)
     score(only.folder, objects={}, materials={})
     record = collect(question, scenes, [only], {}).record
     assert (record.runs[0].objects, record.runs[0].materials) == ({}, {})
-    assert (record.scenes[0].black_share or 0.0) < 0.01
     values = {
         "psnr": 20.0, "normal_mae_deg": None, "specular_psnr": None, "diffuse_psnr": 30.0, "stokes_error": 0.5,
     }  # fmt: skip
@@ -118,21 +114,6 @@ def test_objects_materials_and_black_pixels_are_collected(planned: Planned, trai
     assert sorted(path.name for path in question.out.glob("*.*")) == [
         "parts.csv", "results.csv", "results.json", "results.md", "results.tex",
     ]  # fmt: skip
-
-
-def test_black_pixels_are_counted(tiny_scene: Scene) -> None:
-    view = tiny_scene.views[0]
-    codes = torch.zeros_like(view.codes)
-    codes[:, 3:6, 3:6] = 2000  # nine pixels, all of whose neighbors get light of theirs
-    height, width = codes.shape[1:3]
-    share = black_share(dataclasses.replace(view, pictures=codes))
-    assert 1 - 25 / (height * width) <= share <= 1 - 9 / (height * width)
-    assert black_share(view) == 0
-    codes[:] = torch.randint(0, 200, codes.shape)  # noise is black
-    assert black_share(dataclasses.replace(view, pictures=codes)) == 1
-    codes[0] = 0  # at one angle the light may be blocked
-    codes[1:] = 2000
-    assert black_share(dataclasses.replace(view, pictures=codes)) == 0
 
 
 def test_speed_times_what_was_not_timed(

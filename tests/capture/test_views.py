@@ -22,6 +22,7 @@ from polarguide.capture import box_filter as boxes
 from polarguide.capture.exposures import FOUR, PLAIN
 from polarguide.capture.variants import (
     SmallerViews,
+    black_pixels,
     empty_pixels,
     has_black_background,
     mask_background,
@@ -328,3 +329,21 @@ def test_it_takes_four_pictures() -> None:
     Fault(expected="0, 45, 90 and 135 degrees").raised_by(
         select_exposures, select_exposures(SCENE, "one"), "two"
     )
+
+
+def test_black_pixels_are_dark_with_their_neighbors_at_all_angles(tiny_scene: Scene) -> None:
+    view = tiny_scene.views[0]
+
+    def share(codes: Tensor) -> float:
+        return float(black_pixels(replace(view, pictures=codes)).float().mean())
+
+    codes = torch.zeros_like(view.codes)
+    codes[:, 3:6, 3:6] = 2000  # nine pixels, whose neighbors are averaged with them
+    height, width = codes.shape[1:3]
+    assert 1 - 25 / (height * width) <= share(codes) <= 1 - 9 / (height * width)
+    assert not black_pixels(view).any()
+    codes[:] = torch.randint(0, 200, codes.shape)  # noise is black
+    assert share(codes) == 1
+    codes[0] = 0  # the filter may block the light at one angle
+    codes[1:] = 2000
+    assert share(codes) == 0

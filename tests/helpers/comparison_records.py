@@ -39,10 +39,9 @@ def unfinished(scene: str, recipe: str, seed: int, error: str | None = None) -> 
 def content(
     runs: list[dict[str, Any]],
     against: str | None = None,
-    black: tuple[str, ...] = (),
     **provenance: Any,
 ) -> dict[str, Any]:
-    """Return the record of these runs as JSON; ``black`` are the scenes on black."""
+    """Return the record of these runs as JSON."""
     scenes, recipes = (list(dict.fromkeys(r[key] for r in runs)) for key in ("scene", "recipe"))
     made = {
         "version": "1",
@@ -58,7 +57,7 @@ def content(
         "format": FORMAT,
         "provenance": {**made, **provenance},
         "settings": {**settings, "background": "auto", "materials": "auto"},
-        "scenes": [{"name": name, **scene, "black_share": 0.6 if name in black else 0.0} for name in scenes],
+        "scenes": [{"name": name, **scene} for name in scenes],
         "recipes": [{"name": name, "about": f"about {name}", "data": {}} for name in recipes],
         "runs": runs,
     }

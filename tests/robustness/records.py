@@ -96,7 +96,7 @@ CASES += table(
     Case("of a seed of 10^30", _run(seed=10**30), passes="a seed is a name"),
     Case("of a run twice", _record(lambda record: record["runs"].append(record["runs"][0])), ci=True),
     Case("of a part of -1 pixels", _run(objects={"o": PART}), prints="pixels", ci=True),
-    Case("of a share of -5", _record(lambda r: r["scenes"][0].update(black_share=-5.0)), prints="black_share", ci=True),
+    Case("of -5 views", _record(lambda r: r["scenes"][0].update(views=-5)), prints="views", ci=True),
     Case("of runs of no scene", _run(scene="elsewhere")),
     Case("against nobody", _record(), more="--against nobody"),
 )  # fmt: skip

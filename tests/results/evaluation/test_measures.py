@@ -10,9 +10,9 @@ import torch
 from known_scene import HEIGHT, WIDTH, known_scene, rendered
 
 from polarguide.capture.exposures import Exposure
+from polarguide.capture.variants import black_pixels
 from polarguide.results.evaluation.scores import score_view, summarize
 from polarguide.results.evaluation.target import SceneFacts, ViewTarget, without_jumps
-from polarguide_bench.plan import black_share
 
 CPU = torch.device("cpu")
 SCENE = known_scene()
@@ -242,7 +242,7 @@ def test_noise_before_nothing_is_black_to_every_measure():
     assert float((brightest > 1 / 255).float().mean()) > 0.3
     assert SceneFacts.of(dark).object_only
     share = float((~VIEW.ground_truth.mask).float().mean())
-    assert black_share(dark.views[0]) == pytest.approx(share, abs=0.2)
+    assert float(black_pixels(dark.views[0]).float().mean()) == pytest.approx(share, abs=0.2)
 
 
 def test_coverage_is_not_scored_where_there_is_a_background():
