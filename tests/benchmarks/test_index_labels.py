@@ -11,7 +11,7 @@ from PIL import Image
 from polarguide.core.errors import PolarguideError
 
 sys.path.append(str(Path(__file__).resolve().parents[2] / "benchmarks" / "accuracy"))
-from index_labels import label_scene  # noqa: E402
+from index_labels import label_scene
 
 NUMBERS = np.array([[0, 1, 1], [2, 2, 1]], dtype=np.uint8)
 VIEWS = [f"v{number}" for number in range(6)]
