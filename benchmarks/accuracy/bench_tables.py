@@ -3,7 +3,7 @@
 The losses against recipes without polarization are first. The tables of polarguide compare and polarguide tables
 contain every metric. These tables contain the metrics of the documentation. A column without any value is left out.
 
-    python benchmarks/accuracy/bench_tables.py benchmarks/results/bench/*.json > tables.md
+    python benchmarks/accuracy/bench_tables.py benchmarks/results/final/bench/*.json > tables.md
 """
 
 from __future__ import annotations

@@ -22,16 +22,17 @@ from matplotlib.figure import Figure
 
 ROOT = Path(__file__).resolve().parents[2]
 RECORDS, FIGURES = ROOT / "benchmarks" / "results", ROOT / "docs" / "figures"
-BENCH = sorted((RECORDS / "bench").glob("*.json"))
+BENCH = sorted((RECORDS / "final" / "bench").glob("*.json"))
 """The eleven scenes of the bench."""
 BASELINE = "3dgs-dr"
 RECIPES = (
     "3dgs",
     "3dgs-dr:consistent",
     "ref-gs",
+    "polgs",
     "polarguide-paper",
     "polarguide-paper:kind",
-    "polarguide",
+    "polarguide-stokes:unpolarized-without-consistency",
     "polarguide-stokes:unpolarized",
     "polarguide-stokes",
 )
