@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 import statistics
+import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -44,6 +45,8 @@ NORMALS, LAYERS = ("normal_mae_deg",), ("specular_psnr", "diffuse_psnr")
 DIELECTRIC = ("specular_psnr_dielectric", "diffuse_psnr_dielectric")
 COLORS = ("#777777", "#e69f00", "#0072b2", "#009e73")
 """Colors of Okabe and Ito, distinguishable with color blindness and in gray."""
+TITLE_WIDTH = 16
+"""Characters in a line of a panel's title."""
 STYLE = {
     "svg.fonttype": "none",  # text stays text: small, searchable files
     "svg.hashsalt": "polarguide",  # reproducible files
@@ -62,7 +65,7 @@ def panels(keys: Sequence[str], height: float, **options: Any) -> tuple[Figure, 
     """Return a figure with the width of a page's text, with a titled panel for each metric."""
     figure, axes = pyplot.subplots(1, len(keys), figsize=(9.6, height), layout="constrained", **options)
     for axis, key in zip(axes, keys, strict=True):
-        axis.set_title(BY_KEY[key].heading.replace(" without", "\nwithout"), fontsize=9)
+        axis.set_title(textwrap.fill(BY_KEY[key].heading, TITLE_WIDTH), fontsize=9)
     return figure, list(axes)
 
 
@@ -75,7 +78,7 @@ def save(figure: Figure, name: str) -> None:
 def draw_recipes(scenes: Scenes) -> None:
     """Draw the gain of each recipe over the baseline: a dot for each scene, a bar for the mean."""
     keys = (*PICTURE, *NORMALS, *DIELECTRIC)
-    figure, axes = panels(keys, 3.4, sharey=True)
+    figure, axes = panels(keys, 3.6, sharey=True)
     for axis, key in zip(axes, keys, strict=True):
         base = by_scene(scenes, BASELINE, of_run(key))
         for row, recipe in enumerate(RECIPES):
@@ -86,7 +89,8 @@ def draw_recipes(scenes: Scenes) -> None:
                 axis.plot(gains, [row] * len(gains), "o", color=color, alpha=0.45, markersize=4, mew=0)
                 axis.plot(statistics.fmean(gains), row, "|", color=color, markersize=18, markeredgewidth=2.5)
         axis.axvline(0, color="#222222", linewidth=0.8)
-    axes[0].set_yticks(range(len(RECIPES)), RECIPES)
+    labels = [recipe.replace("-without", "\n-without") for recipe in RECIPES]
+    axes[0].set_yticks(range(len(RECIPES)), labels)
     axes[0].invert_yaxis()
     figure.supxlabel(f"difference to {BASELINE}; dots are scenes, bars their mean", fontsize=9)
     save(figure, "recipes")

@@ -178,7 +178,7 @@ def test_with_one_seed_noise_is_judged_by_the_known_scatter() -> None:
     assert (found["mean"], found["low"], found["high"]) == pytest.approx(
         (0.3, 0.3, 0.3)
     )  # the same on every view
-    assert found[["over", "count", "noise"]].tolist() == ["views", 4, True]  # 1.96 times 0.23 is 0.45
+    assert found[["over", "count", "noise"]].tolist() == ["views", 4, True]
     levels = {
         name: {f"v{k}": level + 0.01 * k * k for k in range(4)} for name, level in (("r", 0.1), (FREE, 0.2))
     }
