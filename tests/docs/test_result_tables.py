@@ -44,6 +44,11 @@ def page_table(page, *headings):
     return table_of_page(f"results/{page}", *headings)
 
 
+def page_text(page):
+    """Text of a page of results with single spaces."""
+    return " ".join((ROOT / "docs" / "results" / f"{page}.md").read_text(encoding="utf-8").split())
+
+
 def printed(lines):
     """Rows of a printed table by the first cell."""
     (table,) = tables_of(list(lines))
@@ -103,7 +108,7 @@ def test_losses():
     assert [[*row.values()] for row in stated] == [[*row.values()] for row in by_scene]
     method = page_table("new-scenes", "method", "losses")
     assert [[*row.values()] for row in method] == [[*row.values()] for row in by_method]
-    text = " ".join((ROOT / "docs" / "results" / "new-scenes.md").read_text(encoding="utf-8").split())
+    text = page_text("new-scenes")
     assert lines[0] in text
     for stating in ("README.md", "docs/results/index.md"):
         assert f"loses {by_method[0]['losses']} comparisons" in (ROOT / stating).read_text(encoding="utf-8")
@@ -113,7 +118,7 @@ def test_losses():
     ("folder", "scenes", "heading"), [("final/four", FOUR, "method"), ("final/bench", BENCH, "method, bench")]
 )
 def test_losses_of_rendered_scenes(folder, scenes, heading):
-    text = " ".join((ROOT / "docs" / "results" / "index.md").read_text(encoding="utf-8").split())
+    text = page_text("index")
     lines = list(losses.loss_tables(scenes_of(folder, scenes), bench_tables.RECIPE, OTHERS))
     _, by_method, _ = tables_of(lines)
     assert lines[0].removesuffix(".") in text
@@ -155,6 +160,20 @@ def test_gains_by_detection_of_metals():
     (table,) = tables_of(paired_runs.summary(record))
     stated = page_table("metals", "scene", "found metals")
     assert [[*row.values()] for row in stated] == [[*row.values()] for row in table]
+
+
+def test_gains_by_an_own_refractive_index():
+    record = json.loads((ROOT / "benchmarks" / "paired" / "water-index.json").read_text(encoding="utf-8"))
+    (table,) = tables_of(paired_runs.table(record["runs"]["water"], record["less"]["water"]))
+    computed = {row.pop(""): row for row in table}
+    for row in page_table("ablations", "object", "PSNR"):
+        assert row.items() <= {"object": row["object"], **computed[row["object"]]}.items()
+    others = computed.keys() - {paired_runs.WHOLE, paired_runs.DIELECTRICS, "water"}
+    lost = sorted(
+        -float(computed[name]["specular"].split()[0].replace(paired_runs.MINUS, "-")) for name in others
+    )
+    assert len(lost) == 6
+    assert f"six other objects lose {lost[0]:.1f} to {lost[-1]:.1f} dB" in page_text("ablations")
 
 
 def test_mean_gains_on_new_scenes():
