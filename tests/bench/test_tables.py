@@ -162,10 +162,10 @@ def test_rows_without_runs_to_pair_say_so() -> None:
 
 
 def test_differences_to_a_recipe_that_was_asked_for() -> None:
-    table = {"3dgs": 30.0, "s": 29.5, "t": 30.2}
+    table = {"3dgs": 30.0, "s": 29.0, "t": 30.2}
     found = results([run("x", name, 0, psnr=value) for name, value in table.items()], against="3dgs")
     assert rows(against_section(found)) == {
-        ("s", "none, 1 seed"): ["−0.50"],  # noqa: RUF001 - worse, and not noise
+        ("s", "none, 1 seed"): ["−1.00"],  # noqa: RUF001 - worse, and not noise
         ("t", "none, 1 seed"): ["≈ +0.20"],
     }
     assert [section.key for section in sections(found)] == ["scores", "against"]
