@@ -1,7 +1,7 @@
 """Copy a rendered scene, and label an object with its own refractive index.
 
     polarguide synth water --out SCENE --size 192x144 --views 56 --test-every 7 --ground-truth all
-    python benchmarks/accuracy/index_labels.py SCENE OUT --object water --index 1.33 [--every 4]
+    python benchmarks/accuracy/index_labels.py SCENE OUT --object water --index 1.33
 
 One training view in four gets the file materials/VIEW.png, from the object numbers of its ground truth. The value 3 is
 on pixels of the object, and 0 (unknown) elsewhere. ``polarguide train OUT`` then uses the index for this object.
@@ -13,46 +13,54 @@ import argparse
 import json
 import shutil
 from pathlib import Path
+from typing import Any
 
+import msgspec
 import numpy as np
 from PIL import Image
 
 from polarguide.core.errors import PolarguideError, require
 from polarguide.core.files import make_folder, write_text
+from polarguide.core.options import check_choice
+from polarguide.core.records import decode, read_record
 
 LABEL = 3
 """First number in materials/ that stands for a material of scene.json."""
 UNKNOWN = 0
+EVERY = 4
+"""Interval of labeled training views."""
 
 
-def number_of(objects: list[dict[str, object]], name: str) -> int:
-    """Return the object number of an object.
+class Labeled(msgspec.Struct):
+    """Object of a rendered scene, with its number in the ground truth."""
 
-    Raises:
-        PolarguideError: the scene has no object of this name.
-    """
-    numbers = {str(each["name"]): int(str(each["id"])) for each in objects}
-    require(
-        name in numbers,
-        "--object",
-        expected=f"one of {', '.join(numbers)}",
-        found=name,
-        remedy="Correct the name.",
-    )
-    return numbers[name]
+    id: int
+    name: str
 
 
-def label_scene(scene: Path, out: Path, name: str, index: float, every: int) -> int:
+class Rendered(msgspec.Struct):
+    """Objects and training views of a rendered scene."""
+
+    objects: list[Labeled]
+    train: list[str]
+
+
+def label_scene(scene: Path, out: Path, name: str, index: float) -> int:
     """Write the labeled copy of a scene, and return the number of labeled views.
 
     Raises:
-        PolarguideError: the object is unknown, or a training view has no ground truth.
+        PolarguideError: the scene has no valid scene.json or no object of this name, a training view has no ground
+            truth, or the output folder exists.
     """
-    description = json.loads((scene / "scene.json").read_text(encoding="utf-8"))
-    number = number_of(description["objects"], name)
-    views = description["train"][::every]
+    path = scene / "scene.json"
+    remedy = "Render the scene with polarguide synth."
+    description = read_record(path, dict[str, Any], remedy=remedy)
+    rendered = decode(description, Rendered, path, remedy=remedy)
+    numbers = {thing.name: thing.id for thing in rendered.objects}
+    check_choice("--object", name, numbers)
+    views = rendered.train[::EVERY]
     truths = [scene / "gt" / f"{view}.npz" for view in views]
-    missing = [path.name for path in truths if not path.exists()]
+    missing = [truth.name for truth in truths if not truth.exists()]
     require(
         not missing,
         scene / "gt",
@@ -60,11 +68,12 @@ def label_scene(scene: Path, out: Path, name: str, index: float, every: int) -> 
         found=f"no {', '.join(missing)}",
         remedy="Render the scene with --ground-truth all.",
     )
+    require(not out.exists(), out, expected="a new folder", found="a folder", remedy="Choose another folder.")
     shutil.copytree(scene, out)
     make_folder(out / "materials")
-    for view, path in zip(views, truths, strict=True):
-        with np.load(path) as arrays:
-            labels = np.where(arrays["objid"] == number, LABEL, UNKNOWN).astype(np.uint8)
+    for view, truth in zip(views, truths, strict=True):
+        with np.load(truth) as arrays:
+            labels = np.where(arrays["objid"] == numbers[name], LABEL, UNKNOWN).astype(np.uint8)
         Image.fromarray(labels).save(out / "materials" / f"{view}.png")
     description["materials"] = {str(LABEL): {"refractive_index": index, "name": name}}
     write_text(out / "scene.json", json.dumps(description, indent=1) + "\n")
@@ -79,10 +88,9 @@ def main() -> None:
     parser.add_argument("out", type=Path, help="new folder")
     parser.add_argument("--object", required=True, help="name of the object")
     parser.add_argument("--index", type=float, required=True, help="its refractive index")
-    parser.add_argument("--every", type=int, default=4, help="one training view in this many is labeled")
     options = parser.parse_args()
     try:
-        views = label_scene(options.scene, options.out, options.object, options.index, options.every)
+        views = label_scene(options.scene, options.out, options.object, options.index)
     except PolarguideError as error:
         parser.error(str(error))
     print(f"{options.out}: {views} labeled views")

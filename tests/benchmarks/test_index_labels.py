@@ -30,7 +30,7 @@ def scene(tmp_path: Path) -> Path:
 
 def test_one_object_is_labeled_in_every_fourth_view(scene: Path, tmp_path: Path) -> None:
     out = tmp_path / "labeled"
-    assert label_scene(scene, out, "water", 1.33, 4) == 2
+    assert label_scene(scene, out, "water", 1.33) == 2
     assert sorted(path.stem for path in (out / "materials").iterdir()) == ["v0", "v4"]
     for view in ("v0", "v4"):
         labels = np.asarray(Image.open(out / "materials" / f"{view}.png"))
@@ -40,10 +40,14 @@ def test_one_object_is_labeled_in_every_fourth_view(scene: Path, tmp_path: Path)
     assert "materials" not in json.loads((scene / "scene.json").read_text())
 
 
-def test_an_unknown_object_and_missing_ground_truth_are_refused(scene: Path, tmp_path: Path) -> None:
+def test_wrong_scenes_and_an_existing_folder_are_refused(scene: Path, tmp_path: Path) -> None:
+    with pytest.raises(PolarguideError, match="polarguide synth"):
+        label_scene(tmp_path, tmp_path / "a", "water", 1.33)
+    with pytest.raises(PolarguideError, match="a new folder"):
+        label_scene(scene, scene, "water", 1.33)
     with pytest.raises(PolarguideError, match="one of stone, water"):
-        label_scene(scene, tmp_path / "a", "sand", 1.33, 4)
+        label_scene(scene, tmp_path / "a", "sand", 1.33)
     (scene / "gt" / "v4.npz").unlink()
     with pytest.raises(PolarguideError, match="--ground-truth all"):
-        label_scene(scene, tmp_path / "b", "water", 1.33, 4)
+        label_scene(scene, tmp_path / "b", "water", 1.33)
     assert not (tmp_path / "b").exists()
